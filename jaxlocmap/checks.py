@@ -1,0 +1,58 @@
+"""Errors that name the thing, what came and what was expected. Traced values pass: they are flagged at run time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+
+def is_concrete(value: Any) -> bool:
+    """Whether the value can be looked at now, that is, not inside jit, vmap or grad."""
+    return not isinstance(value, jax.core.Tracer)
+
+
+def shape(name: str, value: Any, expected: tuple[int | None, ...]) -> None:
+    """Raise unless `value` has the expected shape; None stands for any length.
+
+    Raises:
+        ValueError: the shape differs.
+    """
+    got = np.shape(value)
+    if len(got) != len(expected) or any(e is not None and g != e for g, e in zip(got, expected, strict=True)):
+        wanted = "(" + ", ".join("any" if e is None else str(e) for e in expected) + ")"
+        raise ValueError(f"{name}: expected shape {wanted}, got {got}")
+
+
+def dtype(name: str, value: Any, kind: Any) -> None:
+    """Raise unless the dtype of `value` is of a kind, such as `np.floating`.
+
+    Raises:
+        TypeError: it is of another kind.
+    """
+    got = np.result_type(value)
+    if not jax.dtypes.issubdtype(got, kind):
+        raise TypeError(f"{name}: expected dtype {kind.__name__}, got {got}")
+
+
+def covariance(name: str, value: Any, size: int, *, definite: bool = False) -> None:
+    """Raise unless `value` is a symmetric positive (semi-)definite matrix of finite numbers.
+
+    Raises:
+        ValueError: wrong shape, a non-finite entry, not symmetric, or a negative eigenvalue.
+    """
+    shape(name, value, (size, size))
+    if not is_concrete(value):
+        return
+    matrix = np.asarray(value, np.float64)
+    if not np.all(np.isfinite(matrix)):
+        raise ValueError(f"{name}: expected finite entries, got {matrix.tolist()}")
+    if not np.allclose(matrix, matrix.T, rtol=1e-5, atol=0):
+        raise ValueError(f"{name}: expected a symmetric matrix, got {matrix.tolist()}")
+    # Rounding of the dtype the matrix came in, relative to its largest eigenvalue.
+    eigenvalues = np.linalg.eigvalsh(matrix)
+    slack = size * float(np.finfo(np.result_type(value, np.float32)).eps) * abs(eigenvalues[-1])
+    if eigenvalues[0] < -slack or (definite and eigenvalues[0] <= 0):
+        wanted = "definite" if definite else "semi-definite"
+        raise ValueError(f"{name}: expected a positive {wanted} matrix, got eigenvalues {eigenvalues.tolist()}")

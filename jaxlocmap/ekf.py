@@ -1,0 +1,148 @@
+"""Extended Kalman filter of a pose: predict, update, gate. Bare arrays in, bare arrays out; no loop.
+
+Throughout, a pose error is truth minus estimate with the heading wrapped, and Jacobians are taken at the estimate.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import scipy.special
+
+from jaxlocmap import landmarks as sensor
+from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve
+from jaxlocmap.motion import MotionModel, wrap
+
+
+class Update(NamedTuple):
+    """What a correction made of one observation of dimension m."""
+
+    mean: jax.Array  # (3,) m, m, rad; unchanged where not accepted
+    cov: jax.Array  # (3, 3); unchanged where not accepted
+    innovation: jax.Array  # (m,)
+    S: jax.Array  # (m, m) covariance of the innovation
+    nis: jax.Array  # () squared Mahalanobis distance of the innovation
+    accepted: jax.Array  # () bool
+    log_likelihood: jax.Array  # () nats, log N(innovation; 0, S)
+
+
+def gate_threshold(probability: float | None, dimension: int) -> float:
+    """Quantile of χ² with `dimension` degrees: a good observation's distance stays below it with `probability`.
+
+    Raises:
+        ValueError: `probability` outside (0, 1); None means no gate and gives infinity.
+    """
+    if probability is None:
+        return float("inf")
+    if not 0 < probability < 1:
+        raise ValueError(f"gate probability: expected a value inside (0, 1), got {probability}")
+    return float(2 * scipy.special.gammaincinv(dimension / 2, probability))
+
+
+def predict(
+    mean: jax.Array,
+    cov: jax.Array,
+    control: jax.Array,
+    dt: jax.Array,
+    Q: jax.Array,
+    *,
+    motion: MotionModel,
+    nominal_dt: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Move the belief by a control.
+
+        x ← f(x, u, dt),   P ← F P Fᵀ + G Q Gᵀ · nominal_dt / dt
+
+    The ratio makes Q the noise of one nominal period whatever the step length: two half steps add as much as one
+    whole. At dt = 0, where G is zero, nothing is added.
+
+    Args:
+        mean: (3,) m, m, rad. cov: (3, 3). control: (2,) m/s, rad/s. dt: () s, >= 0.
+        Q: (2, 2) covariance of the control over `nominal_dt` seconds.
+
+    Returns:
+        mean (3,), cov (3, 3), symmetric to the last bit. Source: Thrun, Burgard & Fox 2005, section 7.4.
+    """
+    F, G = (Matrix.of(J) for J in motion.jacobians(mean, control, dt))
+    ratio = jnp.where(dt > 0, nominal_dt / jnp.where(dt > 0, dt, 1), 0)
+    P = sandwich(F, Matrix.symmetric(cov)) + sandwich(G, Matrix.symmetric(Q).scale(ratio))
+    return motion.transition(mean, control, dt), P.array(cov.dtype)
+
+
+def update(
+    mean: jax.Array,
+    cov: jax.Array,
+    residual: jax.Array,
+    H: Matrix | jax.Array,
+    R: jax.Array,
+    *,
+    threshold: float = float("inf"),
+    valid: jax.Array | bool = True,
+) -> Update:
+    """Correct the belief by one observation of any sensor, in Joseph form, if it passes the gate.
+
+        S = H P Hᵀ + R,  K = P Hᵀ S⁻¹,  d² = rᵀ S⁻¹ r
+        if d² < threshold:  x ← x + K r,  P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ
+
+    Args:
+        mean: (3,) m, m, rad. cov: (3, 3).
+        residual: (m,) observation minus its expectation at `mean`, angles wrapped.
+        H: (m, 3) Jacobian of the expectation. R: (m, m) covariance of the observation.
+        threshold: gate on d², from `gate_threshold(probability, m)`; no gate by default.
+        valid: () bool; False leaves the belief as it is.
+
+    Returns:
+        An `Update`; innovation, S, nis and log-likelihood are there whether or not the gate let it in.
+        Source: Bucy & Joseph 1968, section 16; Bar-Shalom, Li & Kirubarajan 2001, section 5.4 (the gate).
+    """
+    H, P, noise = Matrix.of(H), Matrix.symmetric(cov), Matrix.symmetric(R)
+    m = len(noise.rows)
+    r = tuple(residual[i] for i in range(m))
+    S = sandwich(H, P) + noise
+    L, D = ldl(S)
+    nis = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
+    log_det = sum(jnp.log(d) for d in D)
+    log_likelihood = -0.5 * (nis + log_det + m * jnp.log(2 * jnp.pi).astype(residual.dtype))
+    accepted = (nis < threshold) & valid  # a distance of NaN or infinity fails, with or without a gate
+
+    K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)  # S is symmetric: row i of K solves S k = (P Hᵀ)_i
+    IKH = Matrix.identity(len(P.rows)) - K @ H
+    joseph = sandwich(IKH, P) + sandwich(K, noise)
+    shift = K @ Matrix([x] for x in r)
+    moved = jnp.stack([mean[0] + shift[0, 0], mean[1] + shift[1, 0], wrap(mean[2] + shift[2, 0])])
+    return Update(
+        mean=jnp.where(accepted, moved, mean),
+        cov=jnp.where(accepted, joseph.array(cov.dtype), cov),
+        innovation=residual,
+        S=S.array(cov.dtype),
+        nis=nis,
+        accepted=accepted,
+        log_likelihood=log_likelihood,
+    )
+
+
+def correct(
+    mean: jax.Array,
+    cov: jax.Array,
+    z: jax.Array,
+    landmark: jax.Array,
+    R: jax.Array,
+    *,
+    threshold: float = float("inf"),
+    valid: jax.Array | bool = True,
+    sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Update:
+    """`update` by the range and bearing of one known landmark.
+
+    Args:
+        mean: (3,) m, m, rad. cov: (3, 3). z: (2,) range m, bearing rad. landmark: (2,) m, world frame.
+        R: (2, 2) m², rad². threshold, valid: as in `update`. sensor_offset: (dx, dy, dtheta) in the body frame.
+
+    Returns:
+        An `Update`. A landmark that lies on the sensor has no bearing and is not accepted.
+        Source: Thrun, Burgard & Fox 2005, section 7.4.
+    """
+    residual, H, defined = sensor.linearise(mean, landmark, z, sensor_offset)
+    return update(mean, cov, residual, H, R, threshold=threshold, valid=valid & defined)

@@ -1,0 +1,159 @@
+"""Small matrices with scalar entries, unrolled while tracing.
+
+`F @ P @ F.T` on 3x3 arrays costs a dispatch per product, and a batch of them runs through a general `dot`. With
+scalar entries the same line becomes a few multiply-adds that fuse into vector code, one lane per run of a batch.
+Entries that are the Python integers 0, 1 and -1 are structure: products with them vanish from the program.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+Scalar = Any  # a Python number or an array of shape ()
+
+
+def _mul(a: Scalar, b: Scalar) -> Scalar:
+    for one, other in ((a, b), (b, a)):
+        if isinstance(one, int):
+            if one == 0:
+                return 0
+            if one == 1:
+                return other
+            if one == -1:
+                return -other
+    return a * b
+
+
+def _add(a: Scalar, b: Scalar) -> Scalar:
+    if isinstance(a, int) and a == 0:
+        return b
+    if isinstance(b, int) and b == 0:
+        return a
+    return a + b
+
+
+def _dot(a: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> Scalar:
+    total: Scalar = 0
+    for x, y in zip(a, b, strict=True):
+        total = _add(total, _mul(x, y))
+    return total
+
+
+class Matrix:
+    """A matrix as a tuple of rows of scalars, with `@`, `+`, `-`, `.T` and `[i, j]`."""
+
+    __slots__ = ("rows",)
+
+    def __init__(self, rows: Any) -> None:
+        self.rows: tuple[tuple[Scalar, ...], ...] = tuple(tuple(row) for row in rows)
+
+    @classmethod
+    def of(cls, value: Matrix | jax.Array | np.ndarray) -> Matrix:
+        """A matrix from an array of shape (n, m); a `Matrix` passes through."""
+        if isinstance(value, Matrix):
+            return value
+        n, m = value.shape
+        return cls([value[i, j] for j in range(m)] for i in range(n))
+
+    @classmethod
+    def symmetric(cls, value: Matrix | jax.Array | np.ndarray) -> Matrix:
+        """As `of`, reading the upper triangle and mirroring it."""
+        full = cls.of(value)
+        n = len(full.rows)
+        return cls([full[min(i, j), max(i, j)] for j in range(n)] for i in range(n))
+
+    @classmethod
+    def identity(cls, n: int) -> Matrix:
+        """The identity, all structure."""
+        return cls([int(i == j) for j in range(n)] for i in range(n))
+
+    def array(self, dtype: Any) -> jax.Array:
+        """The same matrix as an array of shape (n, m)."""
+        return jnp.stack([jnp.stack([jnp.asarray(x, dtype) for x in row]) for row in self.rows])
+
+    def __getitem__(self, index: tuple[int, int]) -> Scalar:
+        return self.rows[index[0]][index[1]]
+
+    @property
+    def T(self) -> Matrix:
+        """The transpose."""
+        return Matrix(zip(*self.rows, strict=True))
+
+    def __matmul__(self, other: Matrix) -> Matrix:
+        columns = other.T.rows
+        return Matrix([_dot(row, column) for column in columns] for row in self.rows)
+
+    def __add__(self, other: Matrix) -> Matrix:
+        return Matrix(map(_add, a, b) for a, b in zip(self.rows, other.rows, strict=True))
+
+    def __sub__(self, other: Matrix) -> Matrix:
+        return self + other.scale(-1)
+
+    def scale(self, factor: Scalar) -> Matrix:
+        """Every entry times a scalar."""
+        return Matrix([_mul(factor, x) for x in row] for row in self.rows)
+
+
+def sandwich(A: Matrix, P: Matrix) -> Matrix:
+    """A P Aᵀ for symmetric P: the upper triangle is computed, the lower mirrors it, so symmetry is exact."""
+    AP = A @ P
+    n = len(A.rows)
+    upper = {(i, j): _dot(AP.rows[i], A.rows[j]) for i in range(n) for j in range(i, n)}
+    return Matrix([upper[min(i, j), max(i, j)] for j in range(n)] for i in range(n))
+
+
+def ldl(S: Matrix) -> tuple[Matrix, tuple[Scalar, ...]]:
+    """S = L D Lᵀ with L unit lower triangular (Golub & Van Loan 2013, section 4.1): no square root, and S is
+    positive definite exactly when every pivot in D is positive."""
+    n = len(S.rows)
+    L: list[list[Scalar]] = [[int(i == j) for j in range(n)] for i in range(n)]
+    D: list[Scalar] = []
+    for j in range(n):
+        D.append(S[j, j] - sum(L[j][k] * L[j][k] * D[k] for k in range(j)))
+        for i in range(j + 1, n):
+            L[i][j] = (S[i, j] - sum(L[i][k] * L[j][k] * D[k] for k in range(j))) / D[j]
+    return Matrix(L), tuple(D)
+
+
+def forward(L: Matrix, b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    """y with L y = b, for unit lower triangular L."""
+    y: list[Scalar] = []
+    for i, value in enumerate(b):
+        y.append(value - sum(L[i, k] * y[k] for k in range(i)))
+    return tuple(y)
+
+
+def solve(L: Matrix, D: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
+    """x with L D Lᵀ x = b."""
+    x = [y / d for y, d in zip(forward(L, b), D, strict=True)]
+    n = len(x)
+    for i in reversed(range(n)):
+        x[i] = x[i] - sum(L[k, i] * x[k] for k in range(i + 1, n))
+    return tuple(x)
+
+
+def mahalanobis(S: Matrix, r: tuple[Scalar, ...]) -> Scalar:
+    """rᵀ S⁻¹ r."""
+    L, D = ldl(S)
+    y = forward(L, r)
+    return sum(v * v / d for v, d in zip(y, D, strict=True))
+
+
+def is_psd(P: Matrix) -> Scalar:
+    """Whether a symmetric 3x3 matrix is finite and positive semi-definite, up to rounding.
+
+    Sylvester's criterion on the principal minors, each against the product of its diagonal, so that the answer
+    does not depend on units.
+    """
+    a, b, c = P[0, 0], P[1, 1], P[2, 2]
+    slack = 1 - 64 * jnp.finfo(jnp.result_type(a)).eps
+    ab, ac, bc = P[0, 1] * P[0, 1], P[0, 2] * P[0, 2], P[1, 2] * P[1, 2]
+    det_gap = a * bc + b * ac + c * ab - 2 * P[0, 1] * P[0, 2] * P[1, 2]  # a b c minus the determinant
+    finite = jnp.isfinite(a + b + c)  # with the minors this bounds the other entries too
+    diagonal = (a >= 0) & (b >= 0) & (c >= 0)
+    minors = (slack * ab <= a * b) & (slack * ac <= a * c) & (slack * bc <= b * c)
+    return finite & diagonal & minors & (slack * det_gap <= a * b * c)

@@ -1,0 +1,48 @@
+"""Readers of robot logs, one a format, all returning one `Log`, and the steps made of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jaxlocmap.logs.carmen import read_carmen
+from jaxlocmap.logs.mrclam import read_mrclam
+from jaxlocmap.logs.record import Log
+from jaxlocmap.logs.timeline import Timeline, to_timeline
+from jaxlocmap.logs.tum import write_tum
+from jaxlocmap.logs.woods import read_woods
+
+__all__ = [
+    "FORMATS",
+    "Log",
+    "Timeline",
+    "read",
+    "read_carmen",
+    "read_mrclam",
+    "read_woods",
+    "to_timeline",
+    "write_tum",
+]
+
+FORMATS = ("woods", "mrclam", "carmen")
+
+
+def read(path: str | Path, format: str, robot: int | None = None) -> Log:
+    """Read a log of a named format.
+
+    Args:
+        path: a file for `woods` and `carmen`, a folder for `mrclam`.
+        format: one of `FORMATS`.
+        robot: its number, for `mrclam` only.
+
+    Raises:
+        ValueError: an unknown format, `robot` missing for mrclam or given for another; and as the readers raise.
+        FileNotFoundError: as the readers raise.
+    """
+    if format not in FORMATS:
+        raise ValueError(f"format: expected one of {', '.join(FORMATS)}, got {format!r}")
+    if (robot is None) == (format == "mrclam"):
+        wanted = "a robot's number" if format == "mrclam" else "None: only mrclam has several"
+        raise ValueError(f"robot: expected {wanted} for format {format}, got {robot}")
+    if robot is not None:
+        return read_mrclam(path, robot)
+    return read_woods(path) if format == "woods" else read_carmen(path)

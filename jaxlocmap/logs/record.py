@@ -1,0 +1,75 @@
+"""The record every reader returns: the streams of one robot's log as they were stored."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import field
+
+import numpy as np
+
+from jaxlocmap import checks
+
+_NUMBERS = functools.partial(np.zeros, 0)
+_INTS = functools.partial(np.zeros, 0, np.int32)
+_PAIRS = functools.partial(np.zeros, (0, 2))
+_POSES = functools.partial(np.zeros, (0, 3))
+_SCANS = functools.partial(np.zeros, (0, 0))
+_ZERO = functools.partial(np.zeros, 3)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Log:
+    """One robot's log, float64 NumPy, each stream in file order; length 0 where a stream is absent.
+
+    Bearings and beam angles are counter-clockwise from straight ahead; `sensor_offset` is where the landmark sensor
+    sits in the body frame.
+
+    Raises:
+        ValueError: streams whose shapes do not belong together, a stamp or value that is not finite (`scan` may
+            hold NaN), or a sighting of a row that `landmarks` does not have.
+    """
+
+    name: str
+    landmarks: np.ndarray = field(default_factory=_PAIRS)  # (L, 2) m, world frame
+    odometry_time: np.ndarray = field(default_factory=_NUMBERS)  # (N,) s
+    odometry: np.ndarray = field(default_factory=_PAIRS)  # (N, 2) v m/s, omega rad/s, in force until the next
+    sighting_time: np.ndarray = field(default_factory=_NUMBERS)  # (K,) s
+    sighting_landmark: np.ndarray = field(default_factory=_INTS)  # (K,) int32: row of `landmarks`, -1 unknown
+    sighting: np.ndarray = field(default_factory=_PAIRS)  # (K, 2) range m, bearing rad
+    scan_time: np.ndarray = field(default_factory=_NUMBERS)  # (S,) s
+    scan: np.ndarray = field(default_factory=_SCANS)  # (S, B) m, NaN: no return
+    beam_angles: np.ndarray = field(default_factory=_NUMBERS)  # (B,) rad, body frame
+    truth_time: np.ndarray = field(default_factory=_NUMBERS)  # (J,) s
+    truth: np.ndarray = field(default_factory=_POSES)  # (J, 3) m, m, rad; tracked, or corrected by SLAM
+    sensor_offset: np.ndarray = field(default_factory=_ZERO)  # (3,) m, m, rad in the body frame
+    stated_variance: dict[str, float] | None = None  # v (m/s)^2, w (rad/s)^2, range m^2, bearing rad^2
+    counts: dict[str, int] = field(default_factory=dict)  # what was dropped or repaired: how often
+
+    def __post_init__(self) -> None:
+        stamps, sightings = len(self.odometry_time), len(self.sighting_time)
+        scans, beams, poses = len(self.scan_time), len(self.beam_angles), len(self.truth_time)
+        for name, shape in (
+            ("landmarks", (None, 2)),
+            ("odometry_time", (stamps,)),
+            ("odometry", (stamps, 2)),
+            ("sighting_time", (sightings,)),
+            ("sighting_landmark", (sightings,)),
+            ("sighting", (sightings, 2)),
+            ("scan_time", (scans,)),
+            ("scan", (scans, beams)),
+            ("beam_angles", (beams,)),
+            ("truth_time", (poses,)),
+            ("truth", (poses, 3)),
+            ("sensor_offset", (3,)),
+        ):
+            value = getattr(self, name)
+            checks.shape(name, value, shape)
+            if name != "scan" and not np.all(np.isfinite(value)):
+                raise ValueError(f"{name}: expected finite values, got {np.sum(~np.isfinite(value))} others")
+        rows = self.sighting_landmark
+        if sightings and not (rows.min() >= -1 and rows.max() < len(self.landmarks)):
+            raise ValueError(
+                f"sighting_landmark: expected rows from -1 to {len(self.landmarks) - 1}, "
+                f"got {rows.min()} to {rows.max()}"
+            )

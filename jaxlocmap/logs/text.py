@@ -1,0 +1,100 @@
+"""Opening plain or gzipped files and parsing columns of numbers, with errors that name path and line."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import zlib
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the content of a file, unpacked if it starts like gzip, whatever its name.
+
+    Raises:
+        FileNotFoundError: nothing at `path`.
+        ValueError: a folder, an empty file, or a truncated or damaged gzip.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    if not path.is_file():
+        raise ValueError(f"{path}: expected a file, got a folder or a device")
+    data = path.read_bytes()
+    if data.startswith(b"\x1f\x8b"):
+        try:
+            data = gzip.decompress(data)
+        except (OSError, EOFError, zlib.error) as error:
+            raise ValueError(f"{path}: truncated or damaged gzip: {error}") from None
+    if not data:
+        raise ValueError(f"{path}: the file is empty")
+    return data
+
+
+def lines(path: str | Path) -> Iterator[tuple[int, str]]:
+    """Yield (line number from 1, stripped line) for each line that is neither blank nor a `#` comment.
+
+    Raises:
+        FileNotFoundError, ValueError: as `read_bytes`; ValueError also for a file with zero bytes in it.
+    """
+    data = read_bytes(path)
+    if b"\0" in data:
+        line = data.count(b"\n", 0, data.index(b"\0")) + 1
+        raise ValueError(f"{path}:{line}: expected text, got binary data")
+    for number, raw in enumerate(data.splitlines(), 1):
+        # Latin-1 takes any byte: old logs have comments in unknown encodings, and numbers are ASCII.
+        line = raw.decode("latin-1").strip()
+        if line and not line.startswith("#"):
+            yield number, line
+
+
+def numbers(fields: Sequence[str], names: Sequence[str], where: str, *, finite: bool = True) -> list[float]:
+    """Parse as many fields as names.
+
+    Raises:
+        ValueError: another number of fields, or one that is no number or (with `finite`) not finite; the
+            message starts with `where` and gives the column's name.
+    """
+    if len(fields) != len(names):
+        listed = ", ".join(names if len(names) <= 10 else [*names[:3], "...", names[-1]])
+        raise ValueError(f"{where}: expected {len(names)} columns ({listed}), got {len(fields)}")
+    return [_number(*pair, where, finite) for pair in zip(names, fields, strict=True)]
+
+
+def _number(name: str, field: str, where: str, finite: bool) -> float:
+    try:
+        value = float(field)
+    except ValueError:
+        value = None
+    if value is None or (finite and not math.isfinite(value)):
+        kind = "a finite number" if finite else "a number"
+        raise ValueError(f"{where}: {name}: expected {kind}, got {field[:40]!r}")
+    return value
+
+
+def table(path: str | Path, names: Sequence[str], *, integer: Collection[str] = ()) -> np.ndarray:
+    """Read white-space separated columns of finite numbers as (rows, len(names)) float64.
+
+    Args:
+        path: plain or gzipped text; blank lines and lines that start with `#` are skipped.
+        names: of the columns, for the messages.
+        integer: names of the columns that must hold whole numbers.
+
+    Raises:
+        FileNotFoundError, ValueError: as `lines`; ValueError also for a line with missing, extra or non-numeric
+            columns (path and line) and for a file without rows.
+    """
+    rows = []
+    for number, line in lines(path):
+        where = f"{path}:{number}"
+        row = numbers(line.split(), names, where)
+        for name, value in zip(names, row, strict=True):
+            if name in integer and not value.is_integer():
+                raise ValueError(f"{where}: {name}: expected a whole number, got {value}")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"{path}: no rows of {', '.join(names)}: only blank lines and comments")
+    return np.array(rows, np.float64)

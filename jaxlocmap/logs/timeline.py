@@ -1,0 +1,169 @@
+"""Streams of different rates become one timeline of steps."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxlocmap.logs.record import Log
+from jaxlocmap.types import Inputs
+
+
+class Timeline(NamedTuple):
+    """A log as steps, float64 NumPy. The prior of a filter is the belief at `time[0]`, since `dt[0]` is 0."""
+
+    time: np.ndarray  # (T,) s, strictly increasing
+    inputs: Inputs  # of NumPy arrays; `ranges` (T, B) m, NaN: no return or no scan at this step
+    truth: np.ndarray  # (T, 3) m, m, rad at `time`, heading in [-pi, pi); NaN where not `truth_valid`
+    truth_valid: np.ndarray  # (T,) bool
+    counts: dict[str, int]  # what the reader and `to_timeline` dropped or repaired: how often
+
+
+def to_timeline(
+    log: Log,
+    *,
+    max_range: float | None = None,
+    start: float | None = None,
+    stop: float | None = None,
+    max_gap: float = 0.5,
+) -> Timeline:
+    """Merge the streams of a log: one step for every distinct stamp of odometry, sighting or scan.
+
+    Step k moves the pose from the previous stamp to its own with the odometry in force in between, `dt[k] >= 0`,
+    then come its sightings, then its scan. The first step has `dt` 0. Events at one stamp share a step, which is
+    the same as a step each with `dt` 0. The number of slots M is the largest number of sightings at one stamp,
+    at least 1; unused slots hold landmark 0, z 0, valid False.
+
+    The counts of the log are joined by: `backward_stamps` (stamps of odometry, sightings and scans below the one
+    before; sorted, ties in file order), `backward_truth` (the same for truth), `duplicate_odometry`,
+    `duplicate_scans`, `duplicate_truth` (same stamp; the last one wins), `duplicate_sightings` (same stamp,
+    landmark and values; one is kept), and sightings or scans dropped: `beyond_max_range`, `before_odometry`
+    (before the first command the motion is unknown), `before_start`, `after_stop`.
+
+    Args:
+        log: with odometry.
+        max_range: m; sightings at or beyond are dropped. None: all are kept.
+        start: s; steps before are dropped, and the command then in force stays in force. To start from a known
+            pose pass the first stamp of the truth.
+        stop: s; steps after are dropped.
+        max_gap: s; truth is interpolated between samples at most this far apart.
+
+    Raises:
+        ValueError: no odometry, no step left between start and stop, or a setting outside its range.
+    """
+    if not len(log.odometry_time):
+        raise ValueError(
+            f"{log.name}: no odometry, so no steps: for mapping take scan_time, scan and truth from the log itself"
+        )
+    if max_range is not None and not max_range > 0:
+        raise ValueError(f"max_range: expected metres > 0, or None, got {max_range}")
+    if not max_gap >= 0:
+        raise ValueError(f"max_gap: expected seconds >= 0, got {max_gap}")
+    counts = dict(log.counts)
+    streams = (log.odometry_time, log.sighting_time, log.scan_time)
+    counts["backward_stamps"] = sum(_backward(stream) for stream in streams)
+    odometry_rows = _last_at_each_stamp(log.odometry_time, counts, "duplicate_odometry")
+    odometry_time, odometry = log.odometry_time[odometry_rows], log.odometry[odometry_rows]
+    sighting_rows = _distinct_sightings(log, counts)
+    if max_range is not None:
+        near = log.sighting[sighting_rows, 0] < max_range
+        counts["beyond_max_range"] = int(np.sum(~near))
+        sighting_rows = sighting_rows[near]
+    scan_rows = _last_at_each_stamp(log.scan_time, counts, "duplicate_scans")
+
+    first, last = _window(start, stop)
+    seen, scanned = log.sighting_time[sighting_rows], log.scan_time[scan_rows]
+    both = np.concatenate([seen, scanned])
+    begin = max(first, odometry_time[0])
+    counts["before_odometry"] = int(np.sum(both < odometry_time[0]))
+    counts["before_start"] = int(np.sum(both < begin)) - counts["before_odometry"]
+    counts["after_stop"] = int(np.sum((both >= begin) & (both > last)))
+    time = np.unique(np.concatenate([odometry_time, both]))
+    time = time[(time >= begin) & (time <= last)]
+    if not len(time):
+        raise ValueError(f"{log.name}: no step between start {start} and stop {stop}")
+    sighting_rows = sighting_rows[(seen >= time[0]) & (seen <= time[-1])]
+    scan_rows = scan_rows[(scanned >= time[0]) & (scanned <= time[-1])]
+
+    previous = np.concatenate([time[:1], time[:-1]])
+    in_force = np.searchsorted(odometry_time, previous, side="right") - 1
+    landmark, z, valid = _slots(log, sighting_rows, time)
+    ranges = None
+    if len(log.scan_time):
+        ranges = np.full((len(time), log.scan.shape[1]), np.nan)
+        ranges[np.searchsorted(time, log.scan_time[scan_rows])] = log.scan[scan_rows]
+    arrays: tuple[Any, ...] = (time - previous, odometry[in_force], landmark, z, valid, ranges)
+    counts["backward_truth"] = _backward(log.truth_time)
+    truth_rows = _last_at_each_stamp(log.truth_time, counts, "duplicate_truth")
+    truth, truth_valid = _interpolate(log.truth_time[truth_rows], log.truth[truth_rows], time, max_gap)
+    return Timeline(time, Inputs(*arrays), truth, truth_valid, counts)
+
+
+def _backward(time: np.ndarray) -> int:
+    return int(np.sum(np.diff(time) < 0))
+
+
+def _last_at_each_stamp(time: np.ndarray, counts: dict[str, int], duplicates: str) -> np.ndarray:
+    """Rows in order of time; of rows with one stamp the last in the file."""
+    order = np.argsort(time, kind="stable")
+    keep = np.diff(time[order], append=np.inf) > 0
+    counts[duplicates] = int(np.sum(~keep))
+    return order[keep]
+
+
+def _distinct_sightings(log: Log, counts: dict[str, int]) -> np.ndarray:
+    """Rows in order of time, ties in file order, without exact repetitions."""
+    events = np.column_stack([log.sighting_time, log.sighting_landmark, log.sighting])
+    _, rows = np.unique(events, axis=0, return_index=True)
+    counts["duplicate_sightings"] = len(events) - len(rows)
+    rows = np.sort(rows)
+    return rows[np.argsort(log.sighting_time[rows], kind="stable")]
+
+
+def _window(start: float | None, stop: float | None) -> tuple[float, float]:
+    first = -math.inf if start is None else float(start)
+    last = math.inf if stop is None else float(stop)
+    if not first <= last:
+        raise ValueError(f"start, stop: expected start <= stop in seconds, got {start}, {stop}")
+    return first, last
+
+
+def _slots(log: Log, rows: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spread sightings, in order of time, over steps: landmark (T, M), z (T, M, 2), valid (T, M)."""
+    step = np.searchsorted(time, log.sighting_time[rows])
+    slot = np.arange(len(rows)) - np.searchsorted(step, step)
+    shape = (len(time), int(slot.max(initial=0)) + 1)
+    landmark, z, valid = np.zeros(shape, np.int32), np.zeros((*shape, 2)), np.zeros(shape, bool)
+    landmark[step, slot] = log.sighting_landmark[rows]
+    z[step, slot] = log.sighting[rows]
+    valid[step, slot] = True
+    return landmark, z, valid
+
+
+def _interpolate(
+    stamps: np.ndarray, poses: np.ndarray, time: np.ndarray, max_gap: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (T, 3) at `time`, headings along the shorter way round, and whether each is known (T,)."""
+    truth = np.full((len(time), 3), np.nan)
+    if not len(stamps):
+        return truth, np.zeros(len(time), bool)
+    left = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, None)
+    # A step on a sample needs no neighbour, so gaps on either side do not matter there.
+    right = np.where(stamps[left] == time, left, np.minimum(left + 1, len(stamps) - 1))
+    gap = stamps[right] - stamps[left]
+    valid = (stamps[left] <= time) & (time <= stamps[right]) & (gap <= max_gap)
+    left, right, gap, at = left[valid], right[valid], gap[valid], time[valid]
+    share = np.where(gap > 0, (at - stamps[left]) / np.where(gap > 0, gap, 1.0), 0.0)
+    change = poses[right] - poses[left]
+    change[:, 2] = _wrap(change[:, 2])
+    truth[valid] = poses[left] + share[:, None] * change
+    truth[:, 2] = _wrap(truth[:, 2])
+    return truth, valid
+
+
+def _wrap(angle: np.ndarray) -> np.ndarray:
+    """Angles in [-pi, pi)."""
+    wrapped = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)  # mod rounds a tiny negative angle up to 2 pi

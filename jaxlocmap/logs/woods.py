@@ -1,0 +1,103 @@
+"""The "lost in the woods" log: a wheeled robot among cylinders, MATLAB v5."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import scipy.io
+
+from jaxlocmap.logs.record import Log
+from jaxlocmap.logs.text import read_bytes
+
+_VECTORS = ("t", "v", "om", "x_true", "y_true", "th_true", "true_valid")
+_SCALARS = ("d", "r_var", "b_var", "v_var", "om_var")
+
+
+def read_woods(path: str | Path) -> Log:
+    """Read the MATLAB file of the "lost in the woods" log.
+
+    The file holds, for N stamps and L landmarks, `t, v, om, x_true, y_true, th_true, true_valid` (N, 1), `r, b`
+    (N, L) with r = 0 where a landmark was not seen, `l` (L, 2) and the scalars `d, r_var, b_var, v_var, om_var`, in
+    s, m and rad. There `v[k], om[k]` describe the motion from stamp k-1 to k; in the record odometry holds from its
+    stamp on, so they get stamp `t[k-1]`, and the first pair, which nothing precedes, is dropped.
+
+    Args:
+        path: of the file, as it is or gzipped.
+
+    Returns:
+        Log with sightings, odometry, truth where it is valid, `sensor_offset` (d, 0, 0) and `stated_variance`.
+        Counts: `odometry_without_interval` (the first pair), `bad_sightings` (negative or non-finite),
+        `invalid_truth`.
+
+    Raises:
+        FileNotFoundError: nothing at `path`.
+        ValueError: no MATLAB file up to version 7, truncated, or a variable that is missing, of another shape, not
+            numeric or not finite, or stamps that do not increase; the message starts with the path.
+
+    Source: T. D. Barfoot, University of Toronto Institute for Aerospace Studies (UTIAS), 2009.
+    """
+    fields = _load(path)
+    stamps = fields["t"].size
+    steps, landmarks = max(stamps, 2), fields["l"].shape[0]
+    shapes = dict.fromkeys(_VECTORS, (steps, 1)) | dict.fromkeys(_SCALARS, (1, 1))
+    shapes |= {"l": (landmarks, 2), "r": (steps, landmarks), "b": (steps, landmarks)}
+    for name, expected in shapes.items():
+        if fields[name].shape != expected:
+            raise ValueError(f"{path}: {name}: expected shape {expected}, got {fields[name].shape}")
+        if name not in ("r", "b") and not np.all(np.isfinite(fields[name])):
+            raise ValueError(f"{path}: {name}: expected finite values")
+    time, distance, bearing = fields["t"][:, 0], fields["r"], fields["b"]
+    if not np.all(np.diff(time) > 0):
+        raise ValueError(
+            f"{path}: t: expected increasing stamps, got {np.sum(np.diff(time) <= 0)} that do not"
+        )
+    seen = np.isfinite(distance) & np.isfinite(bearing) & (distance > 0)
+    step, row = np.nonzero(seen)
+    valid = fields["true_valid"][:, 0] != 0
+    pose = np.hstack([fields["x_true"], fields["y_true"], fields["th_true"]])
+    scalar = {name: float(fields[name][0, 0]) for name in _SCALARS}
+    return Log(
+        name=Path(path).name,
+        landmarks=fields["l"],
+        odometry_time=time[:-1],
+        odometry=np.hstack([fields["v"], fields["om"]])[1:],
+        sighting_time=time[step],
+        sighting_landmark=row.astype(np.int32),
+        sighting=np.column_stack([distance[seen], bearing[seen]]),
+        truth_time=time[valid],
+        truth=pose[valid],
+        sensor_offset=np.array([scalar["d"], 0.0, 0.0]),
+        stated_variance={
+            "v": scalar["v_var"],
+            "w": scalar["om_var"],
+            "range": scalar["r_var"],
+            "bearing": scalar["b_var"],
+        },
+        counts={
+            "odometry_without_interval": 1,
+            "bad_sightings": int(np.sum(~seen & (distance != 0))),
+            "invalid_truth": int(np.sum(~valid)),
+        },
+    )
+
+
+def _load(path: str | Path) -> dict[str, np.ndarray]:
+    """The variables as float64 matrices."""
+    names = [*_VECTORS, "r", "b", "l", *_SCALARS]
+    data = read_bytes(path)
+    try:
+        content = scipy.io.loadmat(io.BytesIO(data), variable_names=names)
+    except Exception as error:  # noqa: BLE001 - damaged bytes surface as any of a dozen types, up to MemoryError
+        raise ValueError(f"{path}: not a readable MATLAB file up to version 7: {error}") from None
+    fields = {}
+    for name in names:
+        if name not in content:
+            raise ValueError(f"{path}: no variable {name}; expected {', '.join(names)}")
+        value = content[name]
+        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub" or value.ndim != 2:
+            got = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}"
+            raise ValueError(f"{path}: {name}: expected a matrix of real numbers, got {got}")
+        fields[name] = value.astype(np.float64)
+    return fields

@@ -1,0 +1,319 @@
+"""The loop: predict the pose, correct it, put the scan into the map. The only scans over time.
+
+`step` is one turn, `run` scans it, `map_scans` is the map's half alone. All are pure; `jit`, `vmap`, `grad` and
+`shard_map` apply as they are, and no value of `params`, `inputs` or `landmarks` is ever compiled in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import custom_vmap
+
+from jaxlocmap import checks, ekf, grid
+from jaxlocmap import landmarks as sensor
+from jaxlocmap.linalg import Matrix, is_psd
+from jaxlocmap.motion import resolve
+from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
+
+
+def init(prior: Gaussian, *, config: Config) -> State:
+    """The state before the first step: the prior is the pose at step -1, and the map knows nothing.
+
+    Args:
+        prior: mean (3,) m, m, rad; cov (3, 3). Its dtype is the dtype of everything that follows.
+        config: `config.grid` None leaves out the map.
+
+    Raises:
+        ValueError: wrong shapes, or a covariance that is not positive semi-definite (when it can be looked at).
+        TypeError: a prior that is not floating point.
+    """
+    mean, cov = (jnp.asarray(x) for x in prior)
+    checks.shape("prior.mean", mean, (3,))
+    checks.dtype("prior.mean", mean, np.floating)
+    checks.covariance("prior.cov", cov, 3)
+    return State(
+        belief=Gaussian(mean, cov.astype(mean.dtype)),
+        log_odds=None if config.grid is None else jnp.zeros(config.grid.shape, mean.dtype),
+        log_likelihood=jnp.zeros((), mean.dtype),
+    )
+
+
+def step(
+    params: Params,
+    state: State,
+    inputs: Inputs,
+    *,
+    landmarks: jax.Array | None = None,
+    beam_angles: jax.Array | None = None,
+    config: Config,
+) -> tuple[State, Info]:
+    """One step: predict, correct by every observation slot in turn, update the map at the corrected pose.
+
+    Args:
+        params: what is tuned. state: from `init` or the step before. inputs: those of one step, no time axis.
+        landmarks: (L, 2) m, world frame; needed if there are slots.
+        beam_angles: (B,) rad, body frame; needed if there is a grid and a scan.
+        config: static.
+
+    Returns:
+        The next state, and what the step reports. A control, step length or observation that is not finite (or a
+        negative step length) is left out and `Info.ok` is False; so it is when the covariance has broken down.
+
+    Raises:
+        ValueError: shapes that do not fit, an unknown motion model.
+        TypeError: landmark ids that are not integers, a `valid` that is not boolean.
+    """
+    _check_step(params, inputs, landmarks, beam_angles, config)
+    dtype = state.belief.mean.dtype  # pinned in init: a carry must not change dtype
+    params, inputs, landmarks, beam_angles = jax.tree.map(
+        lambda x: jnp.asarray(x, dtype if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None),
+        (params, inputs, landmarks, beam_angles),
+    )
+    belief, moved = _predict(params, state.belief, inputs, config)
+    belief, slots, observed = _correct_landmarks(params, belief, inputs, landmarks, config)
+    # A second source of corrections goes here: a scan matched against `state.log_odds`, which the map below has not
+    # yet seen. It takes (params, belief, inputs, state.log_odds) and returns a belief and what it reports, as above.
+    log_odds = _update_map(params, state.log_odds, belief.mean, inputs.ranges, beam_angles, config)
+
+    log_likelihood = state.log_likelihood + jnp.sum(slots.log_likelihood)
+    info = Info(
+        belief=belief,
+        innovation=slots.innovation,
+        S=slots.S,
+        nis=slots.nis,
+        accepted=slots.accepted,
+        log_likelihood=slots.log_likelihood,
+        ok=moved & observed & is_psd(Matrix.of(belief.cov)) & jnp.all(jnp.isfinite(belief.mean)),
+    )
+    return State(belief, log_odds, log_likelihood), info
+
+
+def collect_info(state: State, info: Info, aside: Any) -> Info:
+    """Keep every step's `Info`, never the grid."""
+    del state, aside
+    return info
+
+
+def run(
+    params: Params,
+    state: State,
+    inputs: Inputs,
+    *,
+    landmarks: jax.Array | None = None,
+    beam_angles: jax.Array | None = None,
+    config: Config,
+    collect: Callable[[State, Info, Any], Any] = collect_info,
+    aside: Any = None,
+) -> tuple[State, Any]:
+    """`step` over time.
+
+    Args:
+        params, state, landmarks, beam_angles, config: as in `step`.
+        inputs: leading axis T everywhere.
+        collect: `(state, info, aside_k) -> pytree`, what to keep of each step; `Info` by default. Keep little: what
+            is kept is stored T times a run.
+        aside: pytree with leading axis T handed to `collect` step by step, such as the truth.
+
+    Returns:
+        The last state, and what `collect` returned with a leading axis T. `run` over all steps and `run` over the
+        first and then the rest give the same numbers.
+
+    Raises:
+        ValueError, TypeError: as `step`; also leading axes that differ, and Q or R not positive definite (when they
+            can be looked at).
+    """
+    _check_run(params, inputs)
+
+    def body(state: State, now: tuple[Inputs, Any]) -> tuple[State, Any]:
+        state, info = step(
+            params, state, now[0], landmarks=landmarks, beam_angles=beam_angles, config=config
+        )
+        return state, collect(state, info, now[1])
+
+    return jax.lax.scan(body, state, (inputs, aside))
+
+
+def map_scans(
+    params: Params,
+    log_odds: jax.Array,
+    poses: jax.Array,
+    ranges: jax.Array,
+    *,
+    beam_angles: jax.Array,
+    config: Config,
+) -> jax.Array:
+    """Mapping alone, at given poses.
+
+    Args:
+        params: `l_occ` and `l_free` matter. log_odds: (rows, columns) nats, zeros for a new map.
+        poses: (T, 3) m, m, rad. ranges: (T, B) m. beam_angles: (B,) rad, body frame.
+        config: with a grid.
+
+    Returns:
+        (rows, columns) nats; the same as `run` makes at the same poses.
+
+    Raises:
+        ValueError: no grid in `config`, or shapes that do not fit.
+    """
+    if config.grid is None:
+        raise ValueError("config.grid: expected a GridSpec to map into, got None")
+    checks.shape("log_odds", log_odds, config.grid.shape)
+    checks.shape("poses", poses, (None, 3))
+    checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
+
+    def body(log_odds: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        return _update_map(params, log_odds, now[0], now[1], beam_angles, config), None
+
+    return jax.lax.scan(body, log_odds, (poses, ranges))[0]
+
+
+@custom_vmap
+def any_in_batch(flags: jax.Array) -> jax.Array:
+    """Whether a flag is set, in any run of the batch.
+
+    The predicate of a `cond` that depends on the run makes both branches execute, for every run. This one does not
+    depend on the run, so under `vmap` the branch stays a branch: steps at which nobody observes cost nothing. The
+    branch itself masks per run, so results do not depend on the company a run is in.
+    """
+    return jnp.any(flags)
+
+
+@any_in_batch.def_vmap
+def _any_in_batch_vmap(axis_size: int, in_batched: list[bool], flags: jax.Array) -> tuple[jax.Array, bool]:
+    del axis_size, in_batched
+    return any_in_batch(flags), False
+
+
+def _predict(
+    params: Params, belief: Gaussian, inputs: Inputs, config: Config
+) -> tuple[Gaussian, jax.Array]:
+    """The moved belief, and whether control and step length were usable. Where not, the robot is taken to stand
+    still for a nominal step: the belief still grows by Q."""
+    usable = jnp.all(jnp.isfinite(inputs.control)) & jnp.isfinite(inputs.dt) & (inputs.dt >= 0)
+    mean, cov = ekf.predict(
+        *belief,
+        jnp.where(usable, inputs.control, 0),
+        jnp.where(usable, inputs.dt, config.dt),
+        params.Q,
+        motion=resolve(config.motion),
+        nominal_dt=config.dt,
+    )
+    return Gaussian(mean, cov), usable
+
+
+def _correct_landmarks(
+    params: Params, belief: Gaussian, inputs: Inputs, landmarks: jax.Array | None, config: Config
+) -> tuple[Gaussian, ekf.Update, jax.Array]:
+    """The belief after every slot in turn, what each slot reports (zero where empty), and whether all were usable."""
+    slots = inputs.valid.shape[0]
+    dtype = belief.mean.dtype
+    nothing = ekf.Update(
+        mean=jnp.zeros((slots, 3), dtype),
+        cov=jnp.zeros((slots, 3, 3), dtype),
+        innovation=jnp.zeros((slots, 2), dtype),
+        S=jnp.zeros((slots, 2, 2), dtype),
+        nis=jnp.zeros(slots, dtype),
+        accepted=jnp.zeros(slots, bool),
+        log_likelihood=jnp.zeros(slots, dtype),
+    )
+    if landmarks is None or slots == 0:
+        return belief, nothing, jnp.array(True)
+    known = inputs.landmark < len(landmarks)
+    usable = inputs.valid & jnp.all(jnp.isfinite(inputs.z), axis=-1) & known
+    threshold = ekf.gate_threshold(config.gate_probability, 2)
+
+    def slot(belief: Gaussian, now: tuple[jax.Array, ...]) -> tuple[Gaussian, ekf.Update]:
+        z, landmark, usable = now
+        row = jax.lax.cond(
+            any_in_batch(usable & (landmark < 0)),
+            lambda: jnp.where(
+                landmark < 0,
+                sensor.associate(*belief, z, landmarks, params.R, config.sensor_offset),
+                landmark,
+            ),
+            lambda: landmark,
+        )
+        update = ekf.correct(
+            *belief,
+            z,
+            landmarks[jnp.maximum(row, 0)],
+            params.R,
+            threshold=threshold,
+            valid=usable,
+            sensor_offset=config.sensor_offset,
+        )
+        report = jax.tree.map(lambda x: jnp.where(usable, x, jnp.zeros_like(x)), update)
+        return Gaussian(update.mean, update.cov), report
+
+    def correct() -> tuple[Gaussian, ekf.Update]:
+        z = jnp.where(usable[:, None], inputs.z, 0)
+        return jax.lax.scan(slot, belief, (z, inputs.landmark, usable), unroll=min(slots, 8))
+
+    belief, report = jax.lax.cond(any_in_batch(usable), correct, lambda: (belief, nothing))
+    return belief, report, jnp.all(usable == inputs.valid)
+
+
+def _update_map(
+    params: Params,
+    log_odds: jax.Array | None,
+    pose: jax.Array,
+    ranges: jax.Array | None,
+    beam_angles: jax.Array | None,
+    config: Config,
+) -> jax.Array | None:
+    if config.grid is None or log_odds is None or ranges is None or beam_angles is None:
+        return log_odds
+    return grid.update_log_odds(
+        log_odds,
+        pose,
+        ranges,
+        beam_angles,
+        params.l_occ,
+        params.l_free,
+        spec=config.grid,
+        min_range=config.min_range,
+        max_range=config.max_range,
+    )
+
+
+def _check_step(
+    params: Params,
+    inputs: Inputs,
+    landmarks: jax.Array | None,
+    beam_angles: jax.Array | None,
+    config: Config,
+) -> None:
+    for name, value, size in (("params.Q", params.Q, 2), ("params.R", params.R, 2)):
+        checks.shape(name, value, (size, size))
+    checks.shape("inputs.dt", inputs.dt, ())
+    checks.shape("inputs.control", inputs.control, (2,))
+    checks.shape("inputs.valid", inputs.valid, (None,))
+    slots = np.shape(inputs.valid)[0]
+    checks.shape("inputs.landmark", inputs.landmark, (slots,))
+    checks.shape("inputs.z", inputs.z, (slots, 2))
+    checks.dtype("inputs.control", inputs.control, np.floating)
+    checks.dtype("inputs.landmark", inputs.landmark, np.integer)
+    checks.dtype("inputs.valid", inputs.valid, np.bool_)
+    if slots:
+        if landmarks is None:
+            raise ValueError(f"landmarks: expected (L, 2) for the {slots} observation slots, got None")
+        checks.shape("landmarks", landmarks, (None, 2))
+    if config.grid is not None and inputs.ranges is not None:
+        if beam_angles is None:
+            raise ValueError("beam_angles: expected (B,) for the ranges to map, got None")
+        checks.shape("beam_angles", beam_angles, (None,))
+        checks.shape("inputs.ranges", inputs.ranges, np.shape(beam_angles))
+
+
+def _check_run(params: Params, inputs: Inputs) -> None:
+    params.check()
+    checks.shape("inputs.dt", inputs.dt, (None,))
+    steps = np.shape(inputs.dt)[0]
+    for name, value in inputs._asdict().items():
+        if value is not None and np.shape(value)[:1] != (steps,):
+            raise ValueError(f"inputs.{name}: expected {steps} steps as inputs.dt has, got {np.shape(value)}")

@@ -1,0 +1,239 @@
+"""A consistency study: one simulated run scored against its truth, and the totals of many judged.
+
+    totals = monte_carlo(Study(scenario, config), key, runs, params, world, noise, prior).value
+    report = summarise(totals, config)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlocmap import consistency, grid, simulate
+from jaxlocmap.pipeline import init, run
+from jaxlocmap.types import Config, Gaussian, Info, Params, State
+
+_DIVERGED = 1.0  # m: a run that ends further than this from the truth has lost the robot
+
+
+class MapTotals(NamedTuple):
+    """Of the map at the end of a run, scored on the cells it has seen."""
+
+    entropy_bits: jax.Array  # ()
+    brier: jax.Array  # ()
+    cells: jax.Array  # (bins,) cells by the probability the map gives them
+    probability: jax.Array  # (bins,) sum of those probabilities
+    occupied: jax.Array  # (bins,) how many of those cells are occupied
+
+
+class Totals(NamedTuple):
+    """What a run adds to a study. Every entry is a sum, over steps or observations, then over runs."""
+
+    runs: jax.Array  # ()
+    scored: jax.Array  # (T,) steps whose NEES is finite
+    nees: jax.Array  # (T,)
+    error_square: jax.Array  # (T, 3) m², m², rad²
+    variance: jax.Array  # (T, 3) the filter's own
+    within_two_sigma: jax.Array  # (3,)
+    covered: jax.Array  # (levels,) steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
+    run_nees: jax.Array  # (2,) the run's average NEES, and its square
+    run_nis: jax.Array  # (2,) the run's average NIS, and its square
+    observing_runs: jax.Array  # () runs that saw anything
+    observed: jax.Array  # (T,) observations
+    nis: jax.Array  # (T,)
+    accepted: jax.Array  # (T,)
+    lag_products: jax.Array  # (2,) range, bearing
+    lag_squares: jax.Array  # (2,)
+    lag_pairs: jax.Array  # ()
+    flagged_steps: jax.Array  # () steps whose `Info.ok` is False
+    diverged: jax.Array  # () 1 if the run ended lost
+    map: MapTotals | None
+
+
+class _Scored(NamedTuple):
+    """What is kept of a step."""
+
+    error: jax.Array
+    variance: jax.Array
+    nees: jax.Array
+    nis: jax.Array
+    accepted: jax.Array
+    white: jax.Array
+    ok: jax.Array
+
+
+def _score(state: State, info: Info, truth: jax.Array) -> _Scored:
+    del state
+    error = consistency.pose_error(truth, info.belief.mean)
+    return _Scored(
+        error=error,
+        variance=jnp.diagonal(info.belief.cov),
+        nees=consistency.nees(error, info.belief.cov),
+        nis=info.nis,
+        accepted=info.accepted,
+        white=jax.vmap(consistency.whiten)(info.innovation, info.S),
+        ok=info.ok,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """One run of a consistency study: simulate, filter, score. Hashable, so `monte_carlo` compiles it once."""
+
+    scenario: simulate.Scenario
+    config: Config  # with a grid, the run maps too
+    exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
+
+    def __call__(
+        self, key: jax.Array, params: Params, world: simulate.World, noise: simulate.Noise, prior: Gaussian
+    ) -> Totals:
+        """Totals of the run that `key` stands for."""
+        start_key, key = jax.random.split(key)
+        start = prior.mean if self.exact_prior else simulate.draw_pose(start_key, prior)
+        mapping = self.config.grid is not None
+        truth, inputs = simulate.simulate(key, world, noise, start, scenario=self.scenario, scan=mapping)
+        state, steps = run(
+            params,
+            init(prior, config=self.config),
+            inputs,
+            landmarks=world.landmarks,
+            beam_angles=self.scenario.beam_angles(),
+            config=self.config,
+            collect=_score,
+            aside=truth.pose,
+        )
+        return _totals(steps, inputs.valid, _map_totals(state.log_odds, world, self.config))
+
+
+def _totals(steps: _Scored, valid: jax.Array, map_totals: MapTotals | None) -> Totals:
+    dtype = steps.nees.dtype
+    scored = jnp.isfinite(steps.nees)
+    nees = jnp.where(scored, steps.nees, 0)
+    run_nees = jnp.sum(nees) / jnp.maximum(jnp.sum(scored), 1)
+    observed = jnp.sum(valid)
+    run_nis = jnp.sum(steps.nis) / jnp.maximum(observed, 1)
+    quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
+    products, squares, pairs = consistency.lag_one(steps.white, valid)
+    last = steps.error[-1]
+    # A comparison with NaN is False, so a run that ended without a number counts as lost.
+    kept = last[0] ** 2 + last[1] ** 2 <= _DIVERGED**2
+    return Totals(
+        runs=jnp.ones((), dtype),
+        scored=scored.astype(dtype),
+        nees=nees,
+        error_square=jnp.where(scored[:, None], steps.error**2, 0),
+        variance=jnp.where(scored[:, None], steps.variance, 0),
+        within_two_sigma=jnp.sum(scored[:, None] & (steps.error**2 <= 4 * steps.variance), axis=0).astype(dtype),
+        covered=jnp.stack([jnp.sum(scored & (nees < q)).astype(dtype) for q in quantiles]),
+        run_nees=jnp.stack([run_nees, run_nees**2]),
+        run_nis=jnp.stack([run_nis, run_nis**2]),
+        observing_runs=(observed > 0).astype(dtype),
+        observed=jnp.sum(valid, axis=1).astype(dtype),
+        nis=jnp.sum(steps.nis, axis=1),
+        accepted=jnp.sum(steps.accepted, axis=1).astype(dtype),
+        lag_products=products,
+        lag_squares=squares,
+        lag_pairs=pairs,
+        flagged_steps=jnp.sum(~steps.ok).astype(dtype),
+        diverged=(~kept).astype(dtype),
+        map=map_totals,
+    )
+
+
+def _map_totals(log_odds: jax.Array | None, world: simulate.World, config: Config) -> MapTotals | None:
+    if log_odds is None or config.grid is None:
+        return None
+    occupied, seen = simulate.occupancy(world, config.grid), log_odds != 0
+    bins = grid.calibration(log_odds, occupied, seen)
+    return MapTotals(
+        entropy_bits=grid.entropy_bits(log_odds),
+        brier=grid.brier(log_odds, occupied, seen),
+        cells=bins.cells,
+        probability=jnp.nan_to_num(bins.probability * bins.cells),
+        occupied=jnp.nan_to_num(bins.frequency * bins.cells),
+    )
+
+
+def summarise(totals: Any, config: Config) -> dict[str, Any]:
+    """Judge the totals of a study.
+
+    Args:
+        totals: `Totals` of NumPy arrays, summed over runs. config: the filter's.
+
+    Returns:
+        The statistics by name, ready for JSON. `anees_band_95` comes from the spread between runs around 3;
+        `nees_band_95` is the χ² band of one step's mean over runs, and `nees_steps_in_band` the share of steps in it.
+    """
+    runs = round(float(totals.runs))
+    steps = len(totals.nees)
+    scored = np.maximum(totals.scored, 1)
+    all_scored = max(float(totals.scored.sum()), 1.0)
+    observations = float(totals.observed.sum())
+    anees = consistency.mean_over_runs(*map(float, totals.run_nees), runs, consistency.POSE_DIMENSION)
+    nis = consistency.mean_over_runs(*map(float, totals.run_nis), round(float(totals.observing_runs)), 2)
+    per_step = totals.nees / scored
+    band = consistency.chi2_band(consistency.POSE_DIMENSION, runs)
+    rms = np.sqrt(totals.error_square.sum(0) / all_scored)
+    rate = float(totals.accepted.sum()) / observations if observations else math.nan
+    lag = totals.lag_products / np.where(totals.lag_squares > 0, totals.lag_squares, np.nan)
+    diverged = round(float(totals.diverged))
+    observing = totals.observed > 0
+    report = {
+        "runs": runs,
+        "steps": steps,
+        "anees": anees.value,
+        "anees_standard_error": anees.standard_error,
+        "anees_band_95": anees.band_95,
+        "nis_mean": nis.value,
+        "nis_standard_error": nis.standard_error,
+        "nis_band_95": nis.band_95,
+        "nees_per_step": per_step.tolist(),
+        "nees_band_95": band,
+        "nees_steps_in_band": float(np.mean((per_step >= band[0]) & (per_step <= band[1]))),
+        "nis_per_step": [
+            float(total / count) if count else None
+            for total, count in zip(totals.nis, totals.observed, strict=True)
+        ],
+        "nis_chi2_band_95": [
+            consistency.chi2_band(2, round(float(count))) if count else None for count in totals.observed
+        ],
+        "rmse_per_step": np.sqrt(totals.error_square / scored[:, None]).tolist(),
+        "sigma_per_step": np.sqrt(totals.variance / scored[:, None]).tolist(),
+        "within_two_sigma": dict(
+            zip(("x", "y", "yaw"), (totals.within_two_sigma / all_scored).tolist(), strict=True)
+        ),
+        **{
+            f"coverage_{round(100 * level)}": float(count) / all_scored
+            for level, count in zip(consistency.COVERAGE_LEVELS, totals.covered, strict=True)
+        },
+        "rmse_position_m": float(np.hypot(rms[0], rms[1])),
+        "rmse_yaw_rad": float(rms[2]),
+        "observations": round(observations),
+        "observing_steps": int(observing.sum()),
+        "gate_accept_rate": rate,
+        "gate_nominal_rate": config.gate_probability,
+        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability),
+        "innovation_lag_one": {"range": float(lag[0]), "bearing": float(lag[1])},
+        "innovation_lag_one_band_95": 1.96 / math.sqrt(float(totals.lag_pairs)) if totals.lag_pairs else None,
+        "diverged_runs": diverged,
+        "unscored_steps": round(runs * steps - float(totals.scored.sum())),
+        "flagged_steps": round(float(totals.flagged_steps)),
+        "verdict": consistency.verdict(anees.value, anees.band_95, diverged, runs),
+    }
+    if totals.map is not None:
+        cells = totals.map.cells
+        some = np.maximum(cells, 1)
+        report["map"] = {
+            "entropy_bits": float(totals.map.entropy_bits) / runs,
+            "brier": float(totals.map.brier) / runs,
+            "calibration_error": float(np.abs(totals.map.probability - totals.map.occupied).sum() / cells.sum()),
+            "calibration_cells": (cells / runs).tolist(),
+            "calibration_probability": np.where(cells > 0, totals.map.probability / some, 0).tolist(),
+            "calibration_frequency": np.where(cells > 0, totals.map.occupied / some, 0).tolist(),
+        }
+    return report
