@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
+import jax.core
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -31,8 +32,8 @@ def dtype(name: str, value: Any, kind: Any) -> None:
     Raises:
         TypeError: it is of another kind.
     """
-    got = np.result_type(value)
-    if not jax.dtypes.issubdtype(got, kind):
+    got = jnp.result_type(value)
+    if not jnp.issubdtype(got, kind):
         raise TypeError(f"{name}: expected dtype {kind.__name__}, got {got}")
 
 
@@ -52,7 +53,7 @@ def covariance(name: str, value: Any, size: int, *, definite: bool = False) -> N
         raise ValueError(f"{name}: expected a symmetric matrix, got {matrix.tolist()}")
     # Rounding of the dtype the matrix came in, relative to its largest eigenvalue.
     eigenvalues = np.linalg.eigvalsh(matrix)
-    slack = size * float(np.finfo(np.result_type(value, np.float32)).eps) * abs(eigenvalues[-1])
+    slack = size * float(np.finfo(np.result_type(np.asarray(value), np.float32)).eps) * abs(eigenvalues[-1])
     if eigenvalues[0] < -slack or (definite and eigenvalues[0] <= 0):
         wanted = "definite" if definite else "semi-definite"
         raise ValueError(f"{name}: expected a positive {wanted} matrix, got eigenvalues {eigenvalues.tolist()}")

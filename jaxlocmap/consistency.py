@@ -111,10 +111,12 @@ def mean_over_runs(total: float, total_square: float, runs: int, expected: float
 
     Args:
         total, total_square: sum over runs of the per-run average and of its square. runs: their number.
-        expected: the value if the filter is consistent.
+        expected: the value if the filter is consistent, that is, the degrees of freedom of the χ² that is averaged.
 
     Returns:
-        `Mean`, the band being Student's t with runs - 1 degrees around `expected`; infinite for a single run.
+        `Mean`, the band being Student's t with runs - 1 degrees around `expected`; infinite for a single run. However
+        correlated, an average of χ² variables varies no more than one of them, 2 * expected: a larger spread, such
+        as that of one lost run among many, does not widen the band.
     """
     if runs < 1:
         return Mean(math.nan, math.nan, (-math.inf, math.inf))
@@ -123,7 +125,7 @@ def mean_over_runs(total: float, total_square: float, runs: int, expected: float
         return Mean(value, math.nan, (-math.inf, math.inf))
     variance = max(total_square / runs - value**2, 0.0) * runs / (runs - 1)
     error = math.sqrt(variance / runs)
-    reach = float(scipy.special.stdtrit(runs - 1, 0.975)) * error
+    reach = float(scipy.special.stdtrit(runs - 1, 0.975)) * min(error, math.sqrt(2 * expected / runs))
     return Mean(value, error, (expected - reach, expected + reach))
 
 
@@ -131,37 +133,48 @@ def verdict(anees: float, band: tuple[float, float] | None = None, diverged: int
     """What the average NEES of a pose says about its covariance, with the size of the misfit.
 
     Args:
-        anees: average NEES, 3 if the covariance is honest. band: where it may lie if so; none for a single log,
-            whose errors are correlated in time and give no band.
+        anees: average NEES, 3 if the covariance is honest. band: where it may lie if so; none, or infinite, for a
+            single run or log, whose errors are correlated in time and give no band.
         diverged, runs: how many of how many runs lost the robot.
     """
     lost = f"; {diverged} of {runs} runs diverged" if diverged else ""
     if not math.isfinite(anees):
         return f"not consistent: the NEES is not finite{lost}"
-    ratio = POSE_DIMENSION / anees if anees < POSE_DIMENSION else anees / POSE_DIMENSION
+    if band is not None and not all(map(math.isfinite, band)):
+        band = None
+    small = anees < POSE_DIMENSION
+    ratio = (POSE_DIMENSION / anees if anees > 0 else math.inf) if small else anees / POSE_DIMENSION
     if band is not None and band[0] <= anees <= band[1]:
         text = f"consistent: ANEES {anees:.3g} lies in its 95 % band [{band[0]:.3g}, {band[1]:.3g}]"
     else:
-        side = "under-confident" if anees < POSE_DIMENSION else "over-confident"
-        size = "large" if anees < POSE_DIMENSION else "small"
+        side, size = ("under-confident", "large") if small else ("over-confident", "small")
         where = "" if band is None else f", 95 % band [{band[0]:.3g}, {band[1]:.3g}]"
         text = f"{side}: covariance {ratio:.3g} times too {size} (ANEES {anees:.3g}, 3 expected{where})"
     return text + lost
 
 
-def gate_verdict(accept_rate: float, nominal: float | None) -> str:
-    """What the share of observations the gate lets in says: None as `nominal` means there is no gate."""
+def gate_verdict(accept_rate: float, nominal: float | None, observations: int | None = None) -> str:
+    """What the share of observations the gate lets in says: None as `nominal` means there is no gate.
+
+    With the number of `observations`, a share is called too tight or too loose only where a good filter would show
+    one as extreme in fewer than 25 of 1000 studies (binomial).
+    """
     if nominal is None:
         return "no gate: every observation is used"
     if not math.isfinite(accept_rate):
         return "nothing observed: the gate was never asked"
     rejected, expected = 100 * (1 - accept_rate), 100 * (1 - nominal)
     text = f"the gate rejected {rejected:.3g} % of the observations, {expected:.3g} % expected"
-    if accept_rate < 0.5:
+    if accept_rate < 0.5 * nominal:
         return f"locked out: {text}; the filter is sure of a wrong pose and refuses what would correct it"
-    if rejected > 3 * expected:
+    many = few = 0.0
+    if observations is not None:
+        count = round((1 - accept_rate) * observations)
+        few = float(scipy.special.bdtr(count, observations, 1 - nominal))
+        many = float(scipy.special.bdtrc(count - 1, observations, 1 - nominal)) if count else 1.0
+    if rejected > 3 * expected and many < 0.025:
         return f"too tight: {text}; innovations are larger than the filter believes"
-    if rejected < expected / 3:
+    if rejected < expected / 3 and few < 0.025:
         return f"too loose: {text}; innovations are smaller than the filter believes"
     return text
 

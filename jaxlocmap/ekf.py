@@ -5,7 +5,7 @@ Throughout, a pose error is truth minus estimate with the heading wrapped, and J
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -102,10 +102,10 @@ def update(
     r = tuple(residual[i] for i in range(m))
     S = sandwich(H, P) + noise
     L, D = ldl(S)
-    nis = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
+    nis: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
     log_det = sum(jnp.log(d) for d in D)
     log_likelihood = -0.5 * (nis + log_det + m * jnp.log(2 * jnp.pi).astype(residual.dtype))
-    accepted = (nis < threshold) & valid  # a distance of NaN or infinity fails, with or without a gate
+    accepted = jnp.logical_and(nis < threshold, valid)  # a distance of NaN or infinity fails, with or without a gate
 
     K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)  # S is symmetric: row i of K solves S k = (P Hᵀ)_i
     IKH = Matrix.identity(len(P.rows)) - K @ H

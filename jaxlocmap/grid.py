@@ -12,10 +12,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxlocmap.batching import any_in_batch
 from jaxlocmap.types import GridSpec
 
-# Up to here a float32 product places every cell of a beam exactly; longer beams take an integer division.
-_FLOAT_EXACT_CELLS = 1024
+# Up to here, cells looked at times cells spanned, a float32 product places every cell of a beam exactly; beyond it
+# takes an integer division.
+_FLOAT_EXACT_CELLS = 1024 * 1024
 
 
 class Beams(NamedTuple):
@@ -37,7 +39,8 @@ def cell_of(point: jax.Array, spec: GridSpec) -> jax.Array:
         (..., 2) int32 column, row; may lie outside the map.
     """
     # Far and non-finite points go to a cell just as far outside, instead of wherever an integer wraps to.
-    cells = jnp.floor((point - jnp.array(spec.origin, point.dtype)) / spec.resolution)
+    origin = jnp.broadcast_to(jnp.array(spec.origin, point.dtype), point.shape)
+    cells = jnp.floor((point - origin) / spec.resolution)
     return jnp.clip(jnp.nan_to_num(cells, nan=-1e6), -1e6, 1e6).astype(jnp.int32)
 
 
@@ -70,30 +73,44 @@ def beam_cells(
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     beam_cos, beam_sin = jnp.cos(beam_angles), jnp.sin(beam_angles)
     direction = jnp.stack([cos * beam_cos - sin * beam_sin, sin * beam_cos + cos * beam_sin], axis=-1)
-    ends = pose[:2] + reach[:, None] * direction
+    ends = pose[None, :2] + reach[:, None] * direction
 
     start = cell_of(pose[:2], spec)
-    span = cell_of(ends, spec) - start  # (B, 2)
-    inside = jnp.all((start >= 0) & (start < jnp.array([columns, rows], start.dtype)))
-
-    # A beam of length r spans at most ceil(r / resolution) cells, and leaves the map after at most its longer side.
-    cells = min(math.ceil(max_range / spec.resolution) + 1, max(rows, columns))
-    j = jnp.arange(cells, dtype=jnp.int32)
+    span = cell_of(ends, spec) - start[None]  # (B, 2)
+    j = jnp.arange(_beam_length(spec, max_range), dtype=jnp.int32)[None]  # (1, K)
+    exact = j.size * _longest_span(spec, max_range) <= _FLOAT_EXACT_CELLS
     length = jnp.abs(span)
     n = jnp.max(length, axis=-1, keepdims=True)  # (B, 1)
     column, row = (
-        start[i] + jnp.sign(span[:, i : i + 1]) * _cells_along(j, length[:, i : i + 1], n) for i in (0, 1)
+        start[i] + jnp.sign(span[:, i : i + 1]) * _cells_along(j, length[:, i : i + 1], n, float_exact=exact)
+        for i in (0, 1)
     )
 
-    on_map = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & inside & measured[:, None]
+    on_map = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & _on_map(pose, spec) & measured[:, None]
     ends_here = (j == n) & (ranges < max_range)[:, None]
     return Beams(row, column, free=on_map & (j < n), hit=on_map & ends_here)
 
 
-def _cells_along(j: jax.Array, m: jax.Array, n: jax.Array) -> jax.Array:
+def _on_map(pose: jax.Array, spec: GridSpec) -> jax.Array:
+    cell = cell_of(pose[:2], spec)
+    inside = (cell >= 0) & (cell < jnp.array(spec.shape[::-1], cell.dtype))
+    return jnp.all(inside) & jnp.isfinite(pose[2])
+
+
+def _beam_length(spec: GridSpec, max_range: float) -> int:
+    """Cells of the longest beam that can lie on the map: it leaves the map after the map's longer side."""
+    return min(_longest_span(spec, max_range) + 1, max(spec.shape))
+
+
+def _longest_span(spec: GridSpec, max_range: float) -> int:
+    """Cells from a robot to the end of its longest beam, one spare for rounding."""
+    return math.ceil(max_range / spec.resolution) + 1
+
+
+def _cells_along(j: jax.Array, m: jax.Array, n: jax.Array, *, float_exact: bool) -> jax.Array:
     """ceil(j m / n - 1/2) for integers j, m <= n: how far along one axis cell j of a beam lies."""
     n = jnp.maximum(n, 1)
-    if j.size > _FLOAT_EXACT_CELLS:
+    if not float_exact:
         return (2 * j * m + n - 1) // (2 * n)
     # The argument of the floor keeps 1 / (4 n) away from every integer, more than a float32 product is off by.
     share = 1 / n.astype(jnp.float32)
@@ -124,14 +141,19 @@ def update_log_odds(
     Returns:
         (rows, columns) nats. Source: Elfes 1989; Thrun, Burgard & Fox 2005, section 9.2.
     """
-    beams = beam_cells(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
-    touched = beams.free | beams.hit
-    flat = beams.row * spec.shape[1] + beams.column
     # Cells that are not touched get zero added, each somewhere else: one shared address would serialise the adds.
-    spread = jnp.arange(flat.size, dtype=jnp.int32).reshape(flat.shape) % log_odds.size
-    zero = jnp.zeros((), log_odds.dtype)
-    change = jnp.where(beams.hit, l_occ, jnp.where(beams.free, l_free, zero)).astype(log_odds.dtype)
-    summed = log_odds.ravel().at[jnp.where(touched, flat, spread)].add(change, mode="promise_in_bounds")
+    beams, cells = len(beam_angles), _beam_length(spec, max_range)
+    spread = jnp.arange(beams * cells, dtype=jnp.int32).reshape(beams, cells) % log_odds.size
+    zeros = jnp.zeros(spread.shape, log_odds.dtype)
+
+    def change() -> tuple[jax.Array, jax.Array]:
+        touched = beam_cells(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
+        flat = jnp.where(touched.free | touched.hit, touched.row * spec.shape[1] + touched.column, spread)
+        return flat, jnp.where(touched.hit, l_occ, jnp.where(touched.free, l_free, zeros)).astype(zeros.dtype)
+
+    # The branch also keeps the compiler from merging this arithmetic into the scatter, where it runs cell by cell.
+    flat, amount = jax.lax.cond(any_in_batch(_on_map(pose, spec)), change, lambda: (spread, zeros))
+    summed = log_odds.ravel().at[flat].add(amount, mode="promise_in_bounds")
     return jnp.clip(summed.reshape(log_odds.shape), spec.l_min, spec.l_max)
 
 
@@ -165,8 +187,8 @@ def brier(log_odds: jax.Array, occupied: jax.Array, where: jax.Array) -> jax.Arr
     Returns:
         () in [0, 1]; 0.25 is what knowing nothing scores; NaN without a cell. Source: Brier 1950.
     """
-    square = (probability(log_odds) - occupied) ** 2
-    return jnp.sum(jnp.where(where, square, 0)) / jnp.sum(where)
+    square = (probability(log_odds) - occupied.astype(log_odds.dtype)) ** 2
+    return jnp.sum(jnp.where(where, square, 0)) / jnp.sum(where, dtype=square.dtype)
 
 
 class Calibration(NamedTuple):
@@ -197,7 +219,7 @@ def calibration(log_odds: jax.Array, occupied: jax.Array, where: jax.Array, *, b
 
     cells, mean, share = total(jnp.ones_like(p)), total(p), total(occupied)
     return Calibration(
-        edges=jnp.linspace(0, 1, bins + 1),
+        edges=jnp.linspace(0, 1, bins + 1, dtype=p.dtype),
         cells=cells,
         probability=mean / cells,
         frequency=share / cells,
@@ -210,7 +232,8 @@ def endpoint_covariance(
 ) -> jax.Array:
     """Covariance of the point a beam ends in: why walls turn fuzzy as the pose becomes uncertain.
 
-        Σ = J_ray P J_rayᵀ + J_sensor R J_sensorᵀ,  J_ray = d endpoint / d pose, J_sensor = d endpoint / d (range, angle)
+        Σ = J_ray P J_rayᵀ + J_sensor R J_sensorᵀ
+        J_ray = d endpoint / d pose,  J_sensor = d endpoint / d (range, angle)
 
     Args:
         pose: (3,) m, m, rad. cov: (3, 3) of the pose.

@@ -108,7 +108,8 @@ def sandwich(A: Matrix, P: Matrix) -> Matrix:
 
 def ldl(S: Matrix) -> tuple[Matrix, tuple[Scalar, ...]]:
     """S = L D Lᵀ with L unit lower triangular (Golub & Van Loan 2013, section 4.1): no square root, and S is
-    positive definite exactly when every pivot in D is positive."""
+    positive definite exactly when every pivot in D is positive.
+    """
     n = len(S.rows)
     L: list[list[Scalar]] = [[int(i == j) for j in range(n)] for i in range(n)]
     D: list[Scalar] = []
@@ -120,7 +121,7 @@ def ldl(S: Matrix) -> tuple[Matrix, tuple[Scalar, ...]]:
 
 
 def forward(L: Matrix, b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """y with L y = b, for unit lower triangular L."""
+    """Solve L y = b for unit lower triangular L."""
     y: list[Scalar] = []
     for i, value in enumerate(b):
         y.append(value - sum(L[i, k] * y[k] for k in range(i)))
@@ -128,7 +129,7 @@ def forward(L: Matrix, b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
 
 
 def solve(L: Matrix, D: tuple[Scalar, ...], b: tuple[Scalar, ...]) -> tuple[Scalar, ...]:
-    """x with L D Lᵀ x = b."""
+    """Solve L D Lᵀ x = b."""
     x = [y / d for y, d in zip(forward(L, b), D, strict=True)]
     n = len(x)
     for i in reversed(range(n)):

@@ -24,13 +24,18 @@ class Result(NamedTuple):
 
 
 def use_all_cores() -> int:
-    """One JAX device per processor core of this machine. Call it before anything else touches JAX.
+    """One JAX device per processor core of this machine, if JAX has not started yet.
+
+    Call it before anything else touches JAX: once JAX has started, its devices are settled and stay as they are.
 
     Returns:
         The number of local devices; those of an accelerator where JAX has one.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", cores)
+    try:
+        jax.config.update("jax_num_cpu_devices", cores)
+    except RuntimeError:  # started already
+        pass
     return jax.local_device_count()
 
 
@@ -41,7 +46,7 @@ def monte_carlo(
     *args: Any,
     chunk: int = 256,
     keep_runs: bool = False,
-    devices: Sequence[jax.Device] | None = None,
+    devices: Sequence[Any] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Result:
     """Run a simulation many times and add up what it returns.
@@ -55,7 +60,7 @@ def monte_carlo(
         *args: pytrees of arrays handed to every run: parameters, the world. Changing their values compiles nothing.
         chunk: runs per device and turn. Memory grows with it, not with `runs`.
         keep_runs: return each run's own values instead of their sums.
-        devices: local devices by default.
+        devices: of `jax.local_devices()`, all by default.
         progress: called with the number of runs done after each chunk.
 
     Returns:
@@ -104,7 +109,7 @@ def _compiled(
     one_run: Callable[..., Any],
     chunk: int,
     keep_runs: bool,
-    devices: tuple[jax.Device, ...],
+    devices: tuple[Any, ...],
     structure: Any,
     leaves: tuple[jax.ShapeDtypeStruct, ...],
 ) -> tuple[Callable[..., Any], float]:

@@ -23,7 +23,7 @@ class MotionModel(NamedTuple):
 
 
 def wrap(angle: jax.Array) -> jax.Array:
-    """The angle in [-pi, pi), to rounding; angles already inside come back bit for bit. Derivative 1."""
+    """The angle in [-pi, pi), to rounding; inside, all but the last below pi come back bit for bit. Derivative 1."""
     return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) * (0.5 / jnp.pi))
 
 
@@ -115,9 +115,7 @@ def resolve(model: str | MotionModel) -> MotionModel:
     return MODELS[model]
 
 
-def from_wheels(
-    left: jax.Array, right: jax.Array, wheel_base: float, *, gyro: jax.Array | None = None
-) -> jax.Array:
+def from_wheels(left: jax.Array, right: jax.Array, wheel_base: float, *, gyro: jax.Array | None = None) -> jax.Array:
     """Control of a differential drive: v = (right + left) / 2, omega = (right - left) / wheel_base.
 
     Args:

@@ -12,10 +12,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_batching import custom_vmap
 
 from jaxlocmap import checks, ekf, grid
 from jaxlocmap import landmarks as sensor
+from jaxlocmap.batching import any_in_batch
 from jaxlocmap.linalg import Matrix, is_psd
 from jaxlocmap.motion import resolve
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
@@ -78,7 +78,9 @@ def step(
     belief, slots, observed = _correct_landmarks(params, belief, inputs, landmarks, config)
     # A second source of corrections goes here: a scan matched against `state.log_odds`, which the map below has not
     # yet seen. It takes (params, belief, inputs, state.log_odds) and returns a belief and what it reports, as above.
-    log_odds = _update_map(params, state.log_odds, belief.mean, inputs.ranges, beam_angles, config)
+    log_odds = state.log_odds
+    if log_odds is not None and inputs.ranges is not None and beam_angles is not None:
+        log_odds = _update_map(params, log_odds, belief.mean, inputs.ranges, beam_angles, config)
 
     log_likelihood = state.log_likelihood + jnp.sum(slots.log_likelihood)
     info = Info(
@@ -130,9 +132,7 @@ def run(
     _check_run(params, inputs)
 
     def body(state: State, now: tuple[Inputs, Any]) -> tuple[State, Any]:
-        state, info = step(
-            params, state, now[0], landmarks=landmarks, beam_angles=beam_angles, config=config
-        )
+        state, info = step(params, state, now[0], landmarks=landmarks, beam_angles=beam_angles, config=config)
         return state, collect(state, info, now[1])
 
     return jax.lax.scan(body, state, (inputs, aside))
@@ -160,9 +160,6 @@ def map_scans(
     Raises:
         ValueError: no grid in `config`, or shapes that do not fit.
     """
-    if config.grid is None:
-        raise ValueError("config.grid: expected a GridSpec to map into, got None")
-    checks.shape("log_odds", log_odds, config.grid.shape)
     checks.shape("poses", poses, (None, 3))
     checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
 
@@ -172,28 +169,10 @@ def map_scans(
     return jax.lax.scan(body, log_odds, (poses, ranges))[0]
 
 
-@custom_vmap
-def any_in_batch(flags: jax.Array) -> jax.Array:
-    """Whether a flag is set, in any run of the batch.
-
-    The predicate of a `cond` that depends on the run makes both branches execute, for every run. This one does not
-    depend on the run, so under `vmap` the branch stays a branch: steps at which nobody observes cost nothing. The
-    branch itself masks per run, so results do not depend on the company a run is in.
-    """
-    return jnp.any(flags)
-
-
-@any_in_batch.def_vmap
-def _any_in_batch_vmap(axis_size: int, in_batched: list[bool], flags: jax.Array) -> tuple[jax.Array, bool]:
-    del axis_size, in_batched
-    return any_in_batch(flags), False
-
-
-def _predict(
-    params: Params, belief: Gaussian, inputs: Inputs, config: Config
-) -> tuple[Gaussian, jax.Array]:
+def _predict(params: Params, belief: Gaussian, inputs: Inputs, config: Config) -> tuple[Gaussian, jax.Array]:
     """The moved belief, and whether control and step length were usable. Where not, the robot is taken to stand
-    still for a nominal step: the belief still grows by Q."""
+    still for a nominal step: the belief still grows by Q.
+    """
     usable = jnp.all(jnp.isfinite(inputs.control)) & jnp.isfinite(inputs.dt) & (inputs.dt >= 0)
     mean, cov = ekf.predict(
         *belief,
@@ -252,22 +231,18 @@ def _correct_landmarks(
 
     def correct() -> tuple[Gaussian, ekf.Update]:
         z = jnp.where(usable[:, None], inputs.z, 0)
-        return jax.lax.scan(slot, belief, (z, inputs.landmark, usable), unroll=min(slots, 8))
+        return jax.lax.scan(slot, belief, (z, inputs.landmark, usable), unroll=min(slots, 4))
 
     belief, report = jax.lax.cond(any_in_batch(usable), correct, lambda: (belief, nothing))
     return belief, report, jnp.all(usable == inputs.valid)
 
 
 def _update_map(
-    params: Params,
-    log_odds: jax.Array | None,
-    pose: jax.Array,
-    ranges: jax.Array | None,
-    beam_angles: jax.Array | None,
-    config: Config,
-) -> jax.Array | None:
-    if config.grid is None or log_odds is None or ranges is None or beam_angles is None:
-        return log_odds
+    params: Params, log_odds: jax.Array, pose: jax.Array, ranges: jax.Array, beam_angles: jax.Array, config: Config
+) -> jax.Array:
+    if config.grid is None:
+        raise ValueError("config.grid: expected the GridSpec that the map was made for, got None")
+    checks.shape("log_odds", log_odds, config.grid.shape)
     return grid.update_log_odds(
         log_odds,
         pose,

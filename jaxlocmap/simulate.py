@@ -46,6 +46,9 @@ class Draws(NamedTuple):
     scan: jax.Array | None  # (T, B); None without a scanner
 
 
+_COURSE_GRID = GridSpec(origin=(0.0, 0.0), resolution=0.2, shape=(120, 120))
+
+
 @dataclasses.dataclass(frozen=True)
 class Scenario:
     """A drive and the sensors on board. Frozen and hashable, so static under jit."""
@@ -62,7 +65,8 @@ class Scenario:
     half_view: float = 1.2  # rad: beams from -half_view to half_view
     max_range: float = 8.0  # m
     min_range: float = 0.05  # m
-    grid: GridSpec = GridSpec(origin=(0.0, 0.0), resolution=0.2, shape=(120, 120))
+    grid: GridSpec = _COURSE_GRID
+    exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
 
     def prior(self) -> Gaussian:
         """The belief at step -1, in the default float type."""
@@ -86,7 +90,10 @@ class Scenario:
 
 def room() -> World:
     """A room of 12 x 12 m with one box in it and four landmarks."""
-    corners = [[(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)], [(4.5, 4.0), (7.5, 4.0), (7.5, 6.5), (4.5, 6.5)]]
+    corners = [
+        [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)],
+        [(4.5, 4.0), (7.5, 4.0), (7.5, 6.5), (4.5, 6.5)],
+    ]
     walls = [(ring[i], ring[(i + 1) % 4]) for ring in corners for i in range(4)]
     return World(
         segments=jnp.array(walls),
@@ -121,21 +128,36 @@ CAPSTONE = Scenario(name="capstone", steps=240, command=_capstone_command, start
 """The drive of the course: 24 s along a smooth path from the lower left. The path crosses the box, because the plant
 knows no collisions: near the end the robot stands inside it and its beams end on the box's inner sides."""
 
-LOOP = Scenario(name="loop", steps=2 * _LOOP_STEPS, command=_loop_command, start=(9.0, 5.4, float(np.pi) / 2))
-"""Two laps of a circle of 3 m around the box, through free space: the steady state of a filter."""
+LOOP = Scenario(
+    name="loop",
+    steps=2 * _LOOP_STEPS,
+    command=_loop_command,
+    start=(9.0, 5.4, float(np.pi) / 2),
+    exact_prior=False,
+)
+"""Two laps of a circle of 3 m around the box, through free space: the steady state of a filter. Its prior is honest:
+the true start is drawn from it."""
 
 SCENARIOS = {scenario.name: scenario for scenario in (CAPSTONE, LOOP)}
 
 
 def draw_pose(key: jax.Array, prior: Gaussian) -> jax.Array:
-    """A true pose (3,) from the prior, so that the prior is honest. To start exactly at its mean, use the mean."""
+    """A true pose (3,), m, m, rad, from the prior, so that the prior is honest.
+
+    To start exactly where the filter believes, use `prior.mean`.
+    """
     L = jnp.linalg.cholesky(prior.cov)
     pose = prior.mean + L @ jax.random.normal(key, (3,), prior.mean.dtype)
     return pose.at[2].set(wrap(pose[2]))
 
 
 def draw(key: jax.Array, *, scenario: Scenario, landmarks: int, scan: bool = True) -> Draws:
-    """The standard normals of one simulation, in the default float type."""
+    """The standard normals of one simulation, in the default float type.
+
+    Args:
+        key: of this simulation alone. scenario: static. landmarks: how many the world has.
+        scan: whether the robot has its scanner on.
+    """
     heading, control, sighting, beams = jax.random.split(key, 4)
     looks = -(-scenario.steps // scenario.sight_period)
     return Draws(
@@ -155,14 +177,21 @@ def simulate(
     scenario: Scenario,
     scan: bool = True,
 ) -> tuple[Truth, Inputs]:
-    """One drive: `draw`, then `roll_out`."""
+    """One drive: `draw`, then `roll_out`.
+
+    Args:
+        key: of this drive alone. world, noise: as their fields say.
+        start: (3,) m, m, rad, the true pose at step -1: the prior's mean, or one from `draw_pose`.
+        scenario: static. scan: False leaves out the scanner, which costs most of a simulation.
+
+    Returns:
+        The true poses and what the robot measured, as `roll_out` says.
+    """
     draws = draw(key, scenario=scenario, landmarks=len(world.landmarks), scan=scan)
     return roll_out(draws, world, noise, start, scenario=scenario)
 
 
-def roll_out(
-    draws: Draws, world: World, noise: Noise, start: jax.Array, *, scenario: Scenario
-) -> tuple[Truth, Inputs]:
+def roll_out(draws: Draws, world: World, noise: Noise, start: jax.Array, *, scenario: Scenario) -> tuple[Truth, Inputs]:
     """One drive with given random numbers.
 
         x ← x + v cos(theta) dt,  y ← y + v sin(theta) dt,  theta ← wrap(theta + omega dt + heading noise)
@@ -192,22 +221,25 @@ def roll_out(
         return pose, (pose, control)
 
     _, (poses, controls) = jax.lax.scan(drive, start, (steps, draws.heading))
-    control = controls + draws.control * jnp.stack([jnp.asarray(noise.v), jnp.asarray(noise.w)])
+    control = controls + draws.control * jnp.stack([jnp.asarray(noise.v), jnp.asarray(noise.w)])[None]
 
     count = len(world.landmarks)
     looking = slice(None, None, scenario.sight_period)
-    delta = world.landmarks - poses[looking, None, :2]
+    delta = world.landmarks[None] - poses[looking, None, :2]
     exact = jnp.stack(
-        [jnp.hypot(delta[..., 0], delta[..., 1]), jnp.arctan2(delta[..., 1], delta[..., 0]) - poses[looking, None, 2]],
+        [
+            jnp.hypot(delta[..., 0], delta[..., 1]),
+            jnp.arctan2(delta[..., 1], delta[..., 0]) - poses[looking, None, 2],
+        ],
         axis=-1,
     )
-    z = exact + draws.sighting * jnp.stack([jnp.asarray(noise.range), jnp.asarray(noise.bearing)])
+    z = exact + draws.sighting * jnp.stack([jnp.asarray(noise.range), jnp.asarray(noise.bearing)])[None, None]
     z = z.at[..., 1].set(wrap(z[..., 1]))
     sighted = z[..., 0] < scenario.sight_range
     inputs = Inputs(
         dt=jnp.full(scenario.steps, scenario.dt, poses.dtype),
         control=control,
-        landmark=jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32), (scenario.steps, count)),
+        landmark=jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32)[None], (scenario.steps, count)),
         z=jnp.zeros((scenario.steps, count, 2), poses.dtype).at[looking].set(z),
         valid=jnp.zeros((scenario.steps, count), bool).at[looking].set(sighted),
         ranges=None if draws.scan is None else _scan(draws.scan, poses, world, noise, scenario),
@@ -234,12 +266,13 @@ def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_r
     dx = (cos * table_cos - sin * table_sin)[:, None]  # (B, 1)
     dy = (sin * table_cos + cos * table_sin)[:, None]
     wall = segments[:, 1] - segments[:, 0]  # (S, 2)
-    away = pose[:2] - segments[:, 0]  # (S, 2)
+    away = pose[None, :2] - segments[:, 0]  # (S, 2)
     # pose + t d = a + s wall, by Cramer's rule
-    det = dx * wall[:, 1] - dy * wall[:, 0]  # (B, S)
+    wall_x, wall_y, away_x, away_y = wall[None, :, 0], wall[None, :, 1], away[None, :, 0], away[None, :, 1]
+    det = dx * wall_y - dy * wall_x  # (B, S)
     safe = jnp.where(jnp.abs(det) < 1e-9, 1, det)  # a beam along the wall does not hit it
-    s = (dx * away[:, 1] - dy * away[:, 0]) / safe
-    t = (wall[:, 0] * away[:, 1] - wall[:, 1] * away[:, 0]) / safe
+    s = (dx * away_y - dy * away_x) / safe
+    t = (wall_x * away_y - wall_y * away_x) / safe
     hits = (jnp.abs(det) >= 1e-9) & (s >= 0) & (s <= 1) & (t >= 0)
     return jnp.min(jnp.where(hits, t, max_range), axis=1, initial=max_range)
 
@@ -251,19 +284,20 @@ def occupancy(world: World, spec: GridSpec) -> jax.Array:
         (rows, columns) bool.
     """
     rows, columns = spec.shape
-    low_x = spec.origin[0] + spec.resolution * jnp.arange(columns)[None, :, None]
-    low_y = spec.origin[1] + spec.resolution * jnp.arange(rows)[:, None, None]
-    first, along = world.segments[:, 0], world.segments[:, 1] - world.segments[:, 0]
+    dtype = world.segments.dtype
+    low_x = spec.origin[0] + spec.resolution * jnp.arange(columns, dtype=dtype)[None, :, None]
+    low_y = spec.origin[1] + spec.resolution * jnp.arange(rows, dtype=dtype)[:, None, None]
+    first, along = (x[None, None] for x in (world.segments[:, 0], world.segments[:, 1] - world.segments[:, 0]))
     reach = spec.resolution * 1e-3  # a wall on the edge must not depend on rounding
-    enter, leave = jnp.zeros(()), jnp.ones(())
+    enter, leave = jnp.zeros((), dtype), jnp.ones((), dtype)
     # Clip every wall against every cell, one axis after the other (Liang & Barsky 1984).
     for axis, low in ((0, low_x), (1, low_y)):
-        near, far = low - reach - first[:, axis], low + spec.resolution + reach - first[:, axis]
-        step = along[:, axis]
-        across = step != 0
-        safe = jnp.where(across, step, 1)
+        near, far = low - reach - first[..., axis], low + spec.resolution + reach - first[..., axis]
+        step = along[..., axis]
+        safe = jnp.where(step != 0, step, 1)
         t0, t1 = jnp.minimum(near / safe, far / safe), jnp.maximum(near / safe, far / safe)
         between = (near <= 0) & (far >= 0)
+        across = jnp.broadcast_to(step != 0, near.shape)
         enter = jnp.maximum(enter, jnp.where(across, t0, jnp.where(between, 0, jnp.inf)))
         leave = jnp.minimum(leave, jnp.where(across, t1, jnp.where(between, 1, -jnp.inf)))
     return jnp.any(enter <= leave, axis=-1)

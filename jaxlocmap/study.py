@@ -1,7 +1,7 @@
 """A consistency study: one simulated run scored against its truth, and the totals of many judged.
 
-    totals = monte_carlo(Study(scenario, config), key, runs, params, world, noise, prior).value
-    report = summarise(totals, config)
+totals = monte_carlo(Study(scenario, config), key, runs, params, world, noise, prior).value
+report = summarise(totals, config)
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ class MapTotals(NamedTuple):
     """Of the map at the end of a run, scored on the cells it has seen."""
 
     entropy_bits: jax.Array  # ()
-    brier: jax.Array  # ()
+    brier: jax.Array  # (), 0 for a run that has seen no cell
+    scored: jax.Array  # () 1 if the run has seen any cell
     cells: jax.Array  # (bins,) cells by the probability the map gives them
     probability: jax.Array  # (bins,) sum of those probabilities
     occupied: jax.Array  # (bins,) how many of those cells are occupied
@@ -35,7 +36,8 @@ class Totals(NamedTuple):
     """What a run adds to a study. Every entry is a sum, over steps or observations, then over runs."""
 
     runs: jax.Array  # ()
-    scored: jax.Array  # (T,) steps whose NEES is finite
+    scored_runs: jax.Array  # () runs with any step scored
+    scored: jax.Array  # (T,) steps whose NEES is finite and not negative
     nees: jax.Array  # (T,)
     error_square: jax.Array  # (T, 3) m², m², rad²
     variance: jax.Array  # (T, 3) the filter's own
@@ -43,8 +45,9 @@ class Totals(NamedTuple):
     covered: jax.Array  # (levels,) steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
     run_nees: jax.Array  # (2,) the run's average NEES, and its square
     run_nis: jax.Array  # (2,) the run's average NIS, and its square
-    observing_runs: jax.Array  # () runs that saw anything
-    observed: jax.Array  # (T,) observations
+    observing_runs: jax.Array  # () runs with any observation scored
+    observed: jax.Array  # (T,) observations whose NIS is finite
+    unscored_observations: jax.Array  # () the others: a reading or a belief that is no number
     nis: jax.Array  # (T,)
     accepted: jax.Array  # (T,)
     lag_products: jax.Array  # (2,) range, bearing
@@ -64,19 +67,24 @@ class _Scored(NamedTuple):
     nis: jax.Array
     accepted: jax.Array
     white: jax.Array
+    measured: jax.Array
     ok: jax.Array
 
 
 def _score(state: State, info: Info, truth: jax.Array) -> _Scored:
     del state
     error = consistency.pose_error(truth, info.belief.mean)
+    white = jax.vmap(consistency.whiten)(info.innovation, info.S)
+    # What the filter could not use has S zero; where the belief has broken down, nothing whitens to a number.
+    measured = (info.S[:, 0, 0] > 0) & jnp.all(jnp.isfinite(white), axis=-1)
     return _Scored(
         error=error,
         variance=jnp.diagonal(info.belief.cov),
         nees=consistency.nees(error, info.belief.cov),
-        nis=info.nis,
+        nis=jnp.where(measured, info.nis, 0),
         accepted=info.accepted,
-        white=jax.vmap(consistency.whiten)(info.innovation, info.S),
+        white=jnp.where(measured[:, None], white, 0),
+        measured=measured,
         ok=info.ok,
     )
 
@@ -87,14 +95,13 @@ class Study:
 
     scenario: simulate.Scenario
     config: Config  # with a grid, the run maps too
-    exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
 
     def __call__(
         self, key: jax.Array, params: Params, world: simulate.World, noise: simulate.Noise, prior: Gaussian
     ) -> Totals:
         """Totals of the run that `key` stands for."""
         start_key, key = jax.random.split(key)
-        start = prior.mean if self.exact_prior else simulate.draw_pose(start_key, prior)
+        start = prior.mean if self.scenario.exact_prior else simulate.draw_pose(start_key, prior)
         mapping = self.config.grid is not None
         truth, inputs = simulate.simulate(key, world, noise, start, scenario=self.scenario, scan=mapping)
         state, steps = run(
@@ -112,18 +119,19 @@ class Study:
 
 def _totals(steps: _Scored, valid: jax.Array, map_totals: MapTotals | None) -> Totals:
     dtype = steps.nees.dtype
-    scored = jnp.isfinite(steps.nees)
+    scored = jnp.isfinite(steps.nees) & (steps.nees >= 0)  # below zero the covariance is none
     nees = jnp.where(scored, steps.nees, 0)
     run_nees = jnp.sum(nees) / jnp.maximum(jnp.sum(scored), 1)
-    observed = jnp.sum(valid)
+    observed = jnp.sum(steps.measured)
     run_nis = jnp.sum(steps.nis) / jnp.maximum(observed, 1)
     quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
-    products, squares, pairs = consistency.lag_one(steps.white, valid)
+    products, squares, pairs = consistency.lag_one(steps.white, steps.measured)
     last = steps.error[-1]
     # A comparison with NaN is False, so a run that ended without a number counts as lost.
     kept = last[0] ** 2 + last[1] ** 2 <= _DIVERGED**2
     return Totals(
         runs=jnp.ones((), dtype),
+        scored_runs=jnp.any(scored).astype(dtype),
         scored=scored.astype(dtype),
         nees=nees,
         error_square=jnp.where(scored[:, None], steps.error**2, 0),
@@ -133,7 +141,8 @@ def _totals(steps: _Scored, valid: jax.Array, map_totals: MapTotals | None) -> T
         run_nees=jnp.stack([run_nees, run_nees**2]),
         run_nis=jnp.stack([run_nis, run_nis**2]),
         observing_runs=(observed > 0).astype(dtype),
-        observed=jnp.sum(valid, axis=1).astype(dtype),
+        observed=jnp.sum(steps.measured, axis=1).astype(dtype),
+        unscored_observations=jnp.sum(valid & ~steps.measured).astype(dtype),
         nis=jnp.sum(steps.nis, axis=1),
         accepted=jnp.sum(steps.accepted, axis=1).astype(dtype),
         lag_products=products,
@@ -149,14 +158,20 @@ def _map_totals(log_odds: jax.Array | None, world: simulate.World, config: Confi
     if log_odds is None or config.grid is None:
         return None
     occupied, seen = simulate.occupancy(world, config.grid), log_odds != 0
-    bins = grid.calibration(log_odds, occupied, seen)
+    bins, scored = grid.calibration(log_odds, occupied, seen), jnp.any(seen)
     return MapTotals(
         entropy_bits=grid.entropy_bits(log_odds),
-        brier=grid.brier(log_odds, occupied, seen),
+        brier=jnp.where(scored, grid.brier(log_odds, occupied, seen), 0),
+        scored=scored.astype(log_odds.dtype),
         cells=bins.cells,
         probability=jnp.nan_to_num(bins.probability * bins.cells),
         occupied=jnp.nan_to_num(bins.frequency * bins.cells),
     )
+
+
+def _mean_over_runs(total_and_square: np.ndarray, runs: int, expected: float) -> consistency.Mean:
+    total, square = (float(value) for value in total_and_square)
+    return consistency.mean_over_runs(total, square, runs, expected)
 
 
 def summarise(totals: Any, config: Config) -> dict[str, Any]:
@@ -171,11 +186,11 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
     """
     runs = round(float(totals.runs))
     steps = len(totals.nees)
-    scored = np.maximum(totals.scored, 1)
+    scored = np.where(totals.scored > 0, totals.scored, np.nan)
     all_scored = max(float(totals.scored.sum()), 1.0)
     observations = float(totals.observed.sum())
-    anees = consistency.mean_over_runs(*map(float, totals.run_nees), runs, consistency.POSE_DIMENSION)
-    nis = consistency.mean_over_runs(*map(float, totals.run_nis), round(float(totals.observing_runs)), 2)
+    anees = _mean_over_runs(totals.run_nees, round(float(totals.scored_runs)), consistency.POSE_DIMENSION)
+    nis = _mean_over_runs(totals.run_nis, round(float(totals.observing_runs)), 2)
     per_step = totals.nees / scored
     band = consistency.chi2_band(consistency.POSE_DIMENSION, runs)
     rms = np.sqrt(totals.error_square.sum(0) / all_scored)
@@ -196,17 +211,14 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
         "nees_band_95": band,
         "nees_steps_in_band": float(np.mean((per_step >= band[0]) & (per_step <= band[1]))),
         "nis_per_step": [
-            float(total / count) if count else None
-            for total, count in zip(totals.nis, totals.observed, strict=True)
+            float(total / count) if count else None for total, count in zip(totals.nis, totals.observed, strict=True)
         ],
         "nis_chi2_band_95": [
             consistency.chi2_band(2, round(float(count))) if count else None for count in totals.observed
         ],
         "rmse_per_step": np.sqrt(totals.error_square / scored[:, None]).tolist(),
         "sigma_per_step": np.sqrt(totals.variance / scored[:, None]).tolist(),
-        "within_two_sigma": dict(
-            zip(("x", "y", "yaw"), (totals.within_two_sigma / all_scored).tolist(), strict=True)
-        ),
+        "within_two_sigma": dict(zip(("x", "y", "yaw"), (totals.within_two_sigma / all_scored).tolist(), strict=True)),
         **{
             f"coverage_{round(100 * level)}": float(count) / all_scored
             for level, count in zip(consistency.COVERAGE_LEVELS, totals.covered, strict=True)
@@ -217,10 +229,11 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
         "observing_steps": int(observing.sum()),
         "gate_accept_rate": rate,
         "gate_nominal_rate": config.gate_probability,
-        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability),
+        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability, round(observations)),
         "innovation_lag_one": {"range": float(lag[0]), "bearing": float(lag[1])},
         "innovation_lag_one_band_95": 1.96 / math.sqrt(float(totals.lag_pairs)) if totals.lag_pairs else None,
         "diverged_runs": diverged,
+        "unscored_observations": round(float(totals.unscored_observations)),
         "unscored_steps": round(runs * steps - float(totals.scored.sum())),
         "flagged_steps": round(float(totals.flagged_steps)),
         "verdict": consistency.verdict(anees.value, anees.band_95, diverged, runs),
@@ -230,8 +243,10 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
         some = np.maximum(cells, 1)
         report["map"] = {
             "entropy_bits": float(totals.map.entropy_bits) / runs,
-            "brier": float(totals.map.brier) / runs,
-            "calibration_error": float(np.abs(totals.map.probability - totals.map.occupied).sum() / cells.sum()),
+            "brier": float(totals.map.brier / totals.map.scored) if totals.map.scored else math.nan,
+            "calibration_error": float(np.abs(totals.map.probability - totals.map.occupied).sum() / cells.sum())
+            if totals.map.scored
+            else math.nan,
             "calibration_cells": (cells / runs).tolist(),
             "calibration_probability": np.where(cells > 0, totals.map.probability / some, 0).tolist(),
             "calibration_frequency": np.where(cells > 0, totals.map.occupied / some, 0).tolist(),

@@ -159,8 +159,7 @@ class Config:
             raise ValueError(f"sensor_offset: expected finite (dx, dy, dtheta), got {self.sensor_offset}")
         if not 0 <= self.min_range < self.max_range < math.inf:
             raise ValueError(
-                f"min_range, max_range: expected 0 <= min_range < max_range, "
-                f"got {self.min_range}, {self.max_range}"
+                f"min_range, max_range: expected 0 <= min_range < max_range, got {self.min_range}, {self.max_range}"
             )
 
 

@@ -35,7 +35,8 @@ def read(path: str | Path, format: str, robot: int | None = None) -> Log:
         robot: its number, for `mrclam` only.
 
     Raises:
-        ValueError: an unknown format, `robot` missing for mrclam or given for another; and as the readers raise.
+        ValueError: an unknown format, `robot` missing for mrclam or given for another; and as the readers
+            raise.
         FileNotFoundError: as the readers raise.
     """
     if format not in FORMATS:

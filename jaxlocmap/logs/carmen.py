@@ -16,27 +16,29 @@ _AFTER_RANGES = ("x", "y", "theta", "odom_x", "odom_y", "odom_theta", "time", "h
 def read_carmen(path: str | Path, *, max_range: float = 30.0) -> Log:
     """Read the front laser's scans and their poses.
 
-    Reads lines `FLASER n r1 .. rn x y theta odom_x odom_y odom_theta time host logger_time` in m, rad and s. The
-    stamp is the last field. The fan spans 180 degrees counter-clockwise from -90: beam k points at -90 + 180 k / n
-    degrees for n = 180 and 360, which leave out the last edge, and at -90 + 180 k / (n - 1) otherwise.
+    Reads lines `FLASER n r1 .. rn x y theta odom_x odom_y odom_theta time host logger_time` in m, rad and s.
+    The stamp is the last field. The fan spans 180 degrees counter-clockwise from -90: beam k points at -90 +
+    180 k / n degrees for n = 180 and 360, which leave out the last edge, and at -90 + 180 k / (n - 1)
+    otherwise.
 
     Args:
         path: plain or gzipped text.
         max_range: m; a range at or beyond means no return.
 
     Returns:
-        Log with `scan` (S, n), `beam_angles` (n,) and as truth the pose x, y, theta of each scan, which is as good as
-        whatever corrected the log. It has no odometry: `to_timeline` refuses it. Counts: `no_return` and
-        `bad_ranges` (negative or NaN), both NaN in `scan`; `unknown_lines` (neither FLASER nor ODOM, PARAM, NEFF,
-        SYNC); `backward_stamps` (scans stay in file order).
+        Log with `scan` (S, n), `beam_angles` (n,) and as truth the pose x, y, theta of each scan, which is as
+        good as whatever corrected the log. It has no odometry: `to_timeline` refuses it. Counts: `no_return`
+        and `bad_ranges` (negative or NaN), both NaN in `scan`; `unknown_lines` (neither FLASER nor ODOM,
+        PARAM, NEFF, SYNC); `backward_stamps` (scans stay in file order).
 
     Raises:
         FileNotFoundError: nothing at `path`.
-        ValueError: not text, no FLASER line, a line with missing, extra or non-numeric fields, or one with another
-            number of beams than the first; the message starts with the path and, where there is one, the line.
+        ValueError: not text, no FLASER line, a line with missing, extra or non-numeric fields, or one with
+            another number of beams than the first; the message starts with the path and, where there is one,
+            the line.
 
-    Source: CARMEN, the Carnegie Mellon Robot Navigation Toolkit, log format; logs in Radish, the robotics data set
-    repository (D. Haehnel, for Intel).
+    Source: CARMEN, the Carnegie Mellon Robot Navigation Toolkit, log format; logs in Radish, the robotics
+    data set repository (D. Haehnel, for Intel).
     """
     if not max_range > 0:
         raise ValueError(f"max_range: expected metres > 0, got {max_range}")
@@ -77,9 +79,7 @@ def read_carmen(path: str | Path, *, max_range: float = 30.0) -> Log:
 
 def _beams(fields: list[str], where: str) -> int:
     if not (fields and fields[0].isdecimal() and int(fields[0]) >= 2):
-        raise ValueError(
-            f"{where}: expected a number of beams >= 2, got {fields[0][:40] if fields else 'nothing'!r}"
-        )
+        raise ValueError(f"{where}: expected a number of beams >= 2, got {fields[0][:40] if fields else 'nothing'!r}")
     beams = int(fields[0])
     expected = 1 + beams + len(_AFTER_RANGES)
     if len(fields) != expected:

@@ -16,34 +16,37 @@ _ROBOTS = range(1, 6)  # subjects that move; the others are landmarks
 def read_mrclam(folder: str | Path, robot: int) -> Log:
     """Read one robot of an MRCLAM data set.
 
-    Files in the folder, each as it is or as `.gz`, columns in s, m and rad: `Barcodes.dat` (subject, barcode),
-    `Landmark_Groundtruth.dat` (subject, x, y, sd x, sd y), `RobotN_Odometry.dat` (time, v, omega),
-    `RobotN_Measurement.dat` (time, barcode, range, bearing; its header says subject) and, where the data set has
-    them, `RobotN_Groundtruth.dat` (time, x, y, heading).
+    Files in the folder, each as it is or as `.gz`, columns in s, m and rad: `Barcodes.dat` (subject,
+    barcode), `Landmark_Groundtruth.dat` (subject, x, y, sd x, sd y), `RobotN_Odometry.dat` (time, v, omega),
+    `RobotN_Measurement.dat` (time, barcode, range, bearing; its header says subject) and, where the data set
+    has them, `RobotN_Groundtruth.dat` (time, x, y, heading).
 
     Args:
         folder: of the data set.
         robot: its number, 1 to 5.
 
     Returns:
-        Log with landmarks in the order of their file, odometry, sightings, and truth or none. Counts of sightings
-        dropped: `other_robots` (a robot's barcode, its own included), `unknown_barcodes` (misreads: not in the
-        table), `unmapped_landmarks` (in the table, position not given), `bad_sightings` (range not positive).
+        Log with landmarks in the order of their file, odometry, sightings, and truth or none. Counts of
+        sightings dropped: `other_robots` (a robot's barcode, its own included), `unknown_barcodes` (misreads:
+        not in the table), `unmapped_landmarks` (in the table, position not given), `bad_sightings` (range not
+        positive).
 
     Raises:
         FileNotFoundError: no such folder, or a file missing in it.
-        ValueError: no such robot (the message names those there are), a line with missing, extra, non-numeric or non-finite columns (path and line), a file without
-            rows, a subject or barcode listed twice, or no sighting of a landmark at all.
+        ValueError: no such robot (the message names those there are), a line with missing, extra, non-numeric
+            or non-finite columns (path and line), a file without rows, a subject or barcode listed twice, or
+            no sighting of a landmark at all.
 
-    Source: Leung, Halpern, Barfoot and Liu, "The UTIAS multi-robot cooperative localization and mapping dataset",
-    International Journal of Robotics Research 30(8), 2011.
+    Source: Leung, Halpern, Barfoot and Liu, "The UTIAS multi-robot cooperative localization and mapping
+    dataset", International Journal of Robotics Research 30(8), 2011.
     """
     folder = Path(folder)
     if not folder.exists():
         raise FileNotFoundError(f"{folder}: no such folder")
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected the folder of an MRCLAM data set, got a file")
-    robots = sorted({int(m[1]) for p in folder.iterdir() if (m := re.match(r"Robot(\d+)_.*\.dat", p.name))})
+    matches = [re.match(r"Robot(\d+)_.*\.dat", path.name) for path in folder.iterdir()]
+    robots = sorted({int(match[1]) for match in matches if match})
     if robot not in robots:
         raise ValueError(f"{folder}: no robot {robot!r}; robots there: {robots or 'none'}")
 

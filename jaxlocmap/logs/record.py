@@ -22,12 +22,12 @@ _ZERO = functools.partial(np.zeros, 3)
 class Log:
     """One robot's log, float64 NumPy, each stream in file order; length 0 where a stream is absent.
 
-    Bearings and beam angles are counter-clockwise from straight ahead; `sensor_offset` is where the landmark sensor
-    sits in the body frame.
+    Bearings and beam angles are counter-clockwise from straight ahead; `sensor_offset` is where the landmark
+    sensor sits in the body frame.
 
     Raises:
-        ValueError: streams whose shapes do not belong together, a stamp or value that is not finite (`scan` may
-            hold NaN), or a sighting of a row that `landmarks` does not have.
+        ValueError: streams whose shapes do not belong together, a stamp or value that is not finite (`scan`
+            may hold NaN), or a sighting of a row that `landmarks` does not have.
     """
 
     name: str

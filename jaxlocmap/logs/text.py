@@ -84,8 +84,8 @@ def table(path: str | Path, names: Sequence[str], *, integer: Collection[str] = 
         integer: names of the columns that must hold whole numbers.
 
     Raises:
-        FileNotFoundError, ValueError: as `lines`; ValueError also for a line with missing, extra or non-numeric
-            columns (path and line) and for a file without rows.
+        FileNotFoundError, ValueError: as `lines`; ValueError also for a line with missing, extra or
+            non-numeric columns (path and line) and for a file without rows.
     """
     rows = []
     for number, line in lines(path):

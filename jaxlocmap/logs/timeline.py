@@ -31,13 +31,13 @@ def to_timeline(
 ) -> Timeline:
     """Merge the streams of a log: one step for every distinct stamp of odometry, sighting or scan.
 
-    Step k moves the pose from the previous stamp to its own with the odometry in force in between, `dt[k] >= 0`,
-    then come its sightings, then its scan. The first step has `dt` 0. Events at one stamp share a step, which is
-    the same as a step each with `dt` 0. The number of slots M is the largest number of sightings at one stamp,
-    at least 1; unused slots hold landmark 0, z 0, valid False.
+    Step k moves the pose from the previous stamp to its own with the odometry in force in between, then
+    come its sightings, then its scan; `dt[k] >= 0`, and `dt[0]` is 0. Events at one stamp share a step, which
+    is the same as a step each with `dt` 0. The number of slots M is the largest number of sightings at one
+    stamp, at least 1; unused slots hold landmark 0, z 0, valid False.
 
-    The counts of the log are joined by: `backward_stamps` (stamps of odometry, sightings and scans below the one
-    before; sorted, ties in file order), `backward_truth` (the same for truth), `duplicate_odometry`,
+    The counts of the log are joined by: `backward_stamps` (stamps of odometry, sightings and scans below the
+    one before; sorted, ties in file order), `backward_truth` (the same for truth), `duplicate_odometry`,
     `duplicate_scans`, `duplicate_truth` (same stamp; the last one wins), `duplicate_sightings` (same stamp,
     landmark and values; one is kept), and sightings or scans dropped: `beyond_max_range`, `before_odometry`
     (before the first command the motion is unknown), `before_start`, `after_stop`.
@@ -45,8 +45,8 @@ def to_timeline(
     Args:
         log: with odometry.
         max_range: m; sightings at or beyond are dropped. None: all are kept.
-        start: s; steps before are dropped, and the command then in force stays in force. To start from a known
-            pose pass the first stamp of the truth.
+        start: s; steps before are dropped, and the command then in force stays in force. To start from a
+            known pose pass the first stamp of the truth.
         stop: s; steps after are dropped.
         max_gap: s; truth is interpolated between samples at most this far apart.
 
@@ -55,7 +55,7 @@ def to_timeline(
     """
     if not len(log.odometry_time):
         raise ValueError(
-            f"{log.name}: no odometry, so no steps: for mapping take scan_time, scan and truth from the log itself"
+            f"{log.name}: no odometry, so no steps: for mapping take scan_time, scan and truth from the log"
         )
     if max_range is not None and not max_range > 0:
         raise ValueError(f"max_range: expected metres > 0, or None, got {max_range}")

@@ -23,8 +23,8 @@ def write_tum(path: str | Path, time: ArrayLike, pose: ArrayLike) -> None:
     Raises:
         ValueError: wrong shapes, no pose, a value that is not finite, or stamps that do not increase.
 
-    Source: Sturm, Engelhard, Endres, Burgard and Cremers, "A benchmark for the evaluation of RGB-D SLAM systems",
-    IROS 2012.
+    Source: Sturm, Engelhard, Endres, Burgard and Cremers, "A benchmark for the evaluation of RGB-D SLAM
+    systems", IROS 2012.
     """
     time, pose = np.asarray(time, np.float64), np.asarray(pose, np.float64)
     checks.shape("time", time, (None,))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 
 import numpy as np
-import scipy.io
 
+from jaxlocmap.logs.matlab import read_matrices
 from jaxlocmap.logs.record import Log
-from jaxlocmap.logs.text import read_bytes
 
 _VECTORS = ("t", "v", "om", "x_true", "y_true", "th_true", "true_valid")
 _SCALARS = ("d", "r_var", "b_var", "v_var", "om_var")
@@ -18,27 +16,30 @@ _SCALARS = ("d", "r_var", "b_var", "v_var", "om_var")
 def read_woods(path: str | Path) -> Log:
     """Read the MATLAB file of the "lost in the woods" log.
 
-    The file holds, for N stamps and L landmarks, `t, v, om, x_true, y_true, th_true, true_valid` (N, 1), `r, b`
-    (N, L) with r = 0 where a landmark was not seen, `l` (L, 2) and the scalars `d, r_var, b_var, v_var, om_var`, in
-    s, m and rad. There `v[k], om[k]` describe the motion from stamp k-1 to k; in the record odometry holds from its
-    stamp on, so they get stamp `t[k-1]`, and the first pair, which nothing precedes, is dropped.
+    The file holds, for N stamps and L landmarks, in s, m and rad: `t, v, om, x_true, y_true, th_true` and
+    `true_valid` (N, 1), `r, b` (N, L) with r = 0 where a landmark was not seen, `l` (L, 2) and the scalars
+    `d, r_var, b_var, v_var, om_var`. There `v[k], om[k]` describe the motion from stamp k-1 to k; in the
+    record odometry holds from its stamp on, so they get stamp `t[k-1]`, and the first pair, which nothing
+    precedes, is dropped.
 
     Args:
         path: of the file, as it is or gzipped.
 
     Returns:
-        Log with sightings, odometry, truth where it is valid, `sensor_offset` (d, 0, 0) and `stated_variance`.
+        Log with sightings, odometry, truth where it is valid, `sensor_offset` (d, 0, 0) and
+        `stated_variance`.
         Counts: `odometry_without_interval` (the first pair), `bad_sightings` (negative or non-finite),
         `invalid_truth`.
 
     Raises:
         FileNotFoundError: nothing at `path`.
-        ValueError: no MATLAB file up to version 7, truncated, or a variable that is missing, of another shape, not
-            numeric or not finite, or stamps that do not increase; the message starts with the path.
+        ValueError: no MATLAB file of version 5 to 7, a truncated or damaged one, a variable that is missing,
+            of another shape, not numeric or not finite, or stamps that do not increase; the message starts
+            with the path.
 
     Source: T. D. Barfoot, University of Toronto Institute for Aerospace Studies (UTIAS), 2009.
     """
-    fields = _load(path)
+    fields = read_matrices(path, (*_VECTORS, "l", "r", "b", *_SCALARS))
     stamps = fields["t"].size
     steps, landmarks = max(stamps, 2), fields["l"].shape[0]
     shapes = dict.fromkeys(_VECTORS, (steps, 1)) | dict.fromkeys(_SCALARS, (1, 1))
@@ -50,9 +51,7 @@ def read_woods(path: str | Path) -> Log:
             raise ValueError(f"{path}: {name}: expected finite values")
     time, distance, bearing = fields["t"][:, 0], fields["r"], fields["b"]
     if not np.all(np.diff(time) > 0):
-        raise ValueError(
-            f"{path}: t: expected increasing stamps, got {np.sum(np.diff(time) <= 0)} that do not"
-        )
+        raise ValueError(f"{path}: t: expected increasing stamps, got {np.sum(np.diff(time) <= 0)} that do not")
     seen = np.isfinite(distance) & np.isfinite(bearing) & (distance > 0)
     step, row = np.nonzero(seen)
     valid = fields["true_valid"][:, 0] != 0
@@ -81,23 +80,3 @@ def read_woods(path: str | Path) -> Log:
             "invalid_truth": int(np.sum(~valid)),
         },
     )
-
-
-def _load(path: str | Path) -> dict[str, np.ndarray]:
-    """The variables as float64 matrices."""
-    names = [*_VECTORS, "r", "b", "l", *_SCALARS]
-    data = read_bytes(path)
-    try:
-        content = scipy.io.loadmat(io.BytesIO(data), variable_names=names)
-    except Exception as error:  # noqa: BLE001 - damaged bytes surface as any of a dozen types, up to MemoryError
-        raise ValueError(f"{path}: not a readable MATLAB file up to version 7: {error}") from None
-    fields = {}
-    for name in names:
-        if name not in content:
-            raise ValueError(f"{path}: no variable {name}; expected {', '.join(names)}")
-        value = content[name]
-        if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub" or value.ndim != 2:
-            got = f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}"
-            raise ValueError(f"{path}: {name}: expected a matrix of real numbers, got {got}")
-        fields[name] = value.astype(np.float64)
-    return fields

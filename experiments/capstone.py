@@ -1,0 +1,122 @@
+"""The single run of the course text, with the course program's own random numbers, in float64."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import CONSOLE, command_line, output_folder, saved, show, write_report
+
+from jaxlocmap import Inputs, consistency, grid, init, plotting, run, simulate
+
+
+@dataclasses.dataclass(frozen=True)
+class CapstoneConfig:
+    """Settings of the run."""
+
+    seed: int = 4
+    """Of NumPy's legacy generator; 4 is the course's."""
+    out: Path = Path("out/capstone")
+    """Folder for report.json, trajectory.png and map.png."""
+    quick: bool = False
+    """Nothing to shorten: the run takes a few seconds."""
+
+
+def course_draws(seed: int, scenario: simulate.Scenario, landmarks: int) -> simulate.Draws:
+    """Standard normals in the order in which the course's program asks for them: a step's heading, speed and yaw
+    rate, range and bearing of each landmark when the detector looks, then the beams.
+    """
+    generator = np.random.RandomState(seed)
+    heading, control, sighting, scan = [], [], [], []
+    for k in range(scenario.steps):
+        heading.append(generator.standard_normal())
+        control.append(generator.standard_normal(2))
+        if k % scenario.sight_period == 0:
+            sighting.append(generator.standard_normal((landmarks, 2)))
+        scan.append(generator.standard_normal(scenario.beams))
+    return simulate.Draws(*(jnp.asarray(np.array(numbers)) for numbers in (heading, control, sighting, scan)))
+
+
+def main(config: CapstoneConfig) -> dict[str, Any]:
+    """Run, write the report and the figures."""
+    out = output_folder(config.out)
+    with jax.enable_x64(True):
+        scenario, world = simulate.CAPSTONE, simulate.room()
+        settings = scenario.config(motion="capstone")
+        draws = course_draws(config.seed, scenario, len(world.landmarks))
+        prior = scenario.prior()
+        truth, inputs = simulate.roll_out(draws, world, simulate.Noise(), prior.mean, scenario=scenario)
+        state, info = run(
+            simulate.course_params(),
+            init(prior, config=settings),
+            Inputs(*inputs),
+            landmarks=world.landmarks,
+            beam_angles=scenario.beam_angles(),
+            config=settings,
+        )
+        error = jax.vmap(consistency.pose_error)(truth.pose, info.belief.mean)
+        nees = jax.vmap(consistency.nees)(error, info.belief.cov)
+        log_odds = state.log_odds
+        assert log_odds is not None  # the scenario has a grid
+        occupancy = grid.probability(log_odds)
+        occupied = simulate.occupancy(world, scenario.grid)
+        report = {
+            "steps": scenario.steps,
+            "seed": config.seed,
+            "final_pose": state.belief.mean.tolist(),
+            "final_cov_diag": jnp.diagonal(state.belief.cov).tolist(),
+            "rmse_position_m": float(jnp.sqrt(jnp.mean(jnp.sum(error[:, :2] ** 2, axis=1)))),
+            "rmse_yaw_rad": float(jnp.sqrt(jnp.mean(error[:, 2] ** 2))),
+            "nees_mean": float(jnp.mean(nees)),
+            "observations": int(inputs.valid.sum()),
+            "gate_accept_rate": float(info.accepted.sum() / inputs.valid.sum()),
+            "occupancy_min": float(occupancy.min()),
+            "occupancy_max": float(occupancy.max()),
+            "occupancy_mean": float(occupancy.mean()),
+            "map_entropy_bits": float(grid.entropy_bits(log_odds)),
+            "map_brier": float(grid.brier(log_odds, occupied, log_odds != 0)),
+        }
+    write_report(out, report)
+    estimate, walls = np.asarray(info.belief.mean), np.asarray(world.segments)
+    plotting.trajectory_figure(
+        out / "trajectory.png",
+        estimate,
+        np.asarray(info.belief.cov),
+        np.asarray(truth.pose),
+        landmarks=np.asarray(world.landmarks),
+        segments=walls,
+        title=f"The course's run: position RMSE {report['rmse_position_m']:.3f} m",
+    )
+    plotting.map_figure(
+        out / "map.png",
+        np.asarray(log_odds),
+        scenario.grid,
+        estimate,
+        truth=np.asarray(truth.pose),
+        segments=walls,
+        title=f"The course's map: {report['map_entropy_bits']:.0f} bits of entropy",
+    )
+    show(
+        f"the course's run, seed {config.seed}",
+        [
+            ("final pose", "{:.8f}, {:.8f}, {:.8f}".format(*report["final_pose"]), ""),
+            ("final covariance, diagonal", "{:.3e}, {:.3e}, {:.3e}".format(*report["final_cov_diag"]), ""),
+            ("position RMSE", f"{report['rmse_position_m']:.4f} m", ""),
+            ("yaw RMSE", f"{report['rmse_yaw_rad']:.4f} rad", ""),
+            ("mean NEES", f"{report['nees_mean']:.3f}", "3 (a mean over runs; one run says little)"),
+            ("occupancy min, max", f"{report['occupancy_min']:.3f}, {report['occupancy_max']:.3f}", ""),
+            ("occupancy mean", f"{report['occupancy_mean']:.4f}", ""),
+            ("map entropy", f"{report['map_entropy_bits']:.1f} bits", ""),
+        ],
+    )
+    CONSOLE.print("one run; for whether the covariance can be believed, run consistency.py", highlight=False)
+    saved(out, "report.json", "trajectory.png", "map.png")
+    return report
+
+
+if __name__ == "__main__":
+    command_line(main, CapstoneConfig)

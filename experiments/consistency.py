@@ -1,0 +1,172 @@
+"""Can the filter's covariance be believed? Thousands of simulated runs, their NEES with its band, and a verdict."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import CONSOLE, command_line, output_folder, params_or, progress_bar, saved, show, write_report
+
+from jaxlocmap import Params, init, plotting, run, simulate
+from jaxlocmap.monte_carlo import monte_carlo, use_all_cores
+from jaxlocmap.study import Study, summarise
+
+
+@dataclasses.dataclass(frozen=True)
+class ConsistencyConfig:
+    """Settings of the study."""
+
+    scenario: Literal["capstone", "loop"] = "capstone"
+    """The drive: the course's, or two laps through free space."""
+    motion: Literal["arc", "euler", "capstone"] = "arc"
+    """The filter's motion model."""
+    runs: int = 2000
+    """How many simulated runs."""
+    params: Path | None = None
+    """JSON file of Q, R, l_occ, l_free; the course's by default."""
+    gate: float | None = 0.99
+    """Probability with which a good observation passes the gate; None for no gate."""
+    map: bool = True
+    """Map as well, and score the map."""
+    seed: int = 0
+    """Of all randomness."""
+    out: Path = Path("out/consistency")
+    """Folder for report.json, nees.png and map.png."""
+    quick: bool = False
+    """A run of a few seconds: 100 runs."""
+
+
+def main(config: ConsistencyConfig) -> dict[str, Any]:
+    """Run the study, write the report and the figures."""
+    out = output_folder(config.out)
+    if config.scenario not in simulate.SCENARIOS:
+        raise ValueError(f"scenario: expected one of {sorted(simulate.SCENARIOS)}, got {config.scenario!r}")
+    runs = min(config.runs, 100) if config.quick else config.runs
+    devices = use_all_cores()
+    scenario = simulate.SCENARIOS[config.scenario]
+    settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=config.map)
+    params = params_or(config.params, simulate.course_params())
+    world, noise, prior = simulate.room(), simulate.Noise(), scenario.prior()
+    key = jax.random.key(config.seed)
+    CONSOLE.print(
+        f"{runs} runs of {scenario.name}, {scenario.steps} steps each, on {devices} {jax.devices()[0].platform} "
+        f"device(s); compiling takes some seconds"
+    )
+
+    began = time.perf_counter()
+    with progress_bar("simulating", runs) as progress:
+        result = monte_carlo(
+            Study(scenario, settings),
+            key,
+            runs,
+            params,
+            world,
+            noise,
+            prior,
+            chunk=64 if config.map else 512,
+            progress=progress,
+        )
+    report = {
+        "scenario": scenario.name,
+        "motion": config.motion,
+        **summarise(result.value, settings),
+        "params": {name: np.asarray(value).tolist() for name, value in params._asdict().items()},
+        "seed": config.seed,
+        "devices": devices,
+        "wall_s": time.perf_counter() - began,
+        "compile_s": result.compile_s,
+        "runs_per_s": runs / result.run_s,
+    }
+    write_report(out, report)
+    plotting.study_figure(out / "nees.png", report, scenario.dt)
+    files = ["report.json", "nees.png"]
+    if config.map:
+        _picture_of_one_run(out / "map.png", key, params, scenario, settings)
+        files.append("map.png")
+    _print(report)
+    saved(out, *files)
+    return report
+
+
+def _picture_of_one_run(path: Path, key: jax.Array, params: Params, scenario: simulate.Scenario, settings: Any) -> None:
+    """The map and path of one more run of the same study, started at the prior's mean."""
+    world, prior = simulate.room(), scenario.prior()
+    truth, inputs = simulate.simulate(key, world, simulate.Noise(), jnp.asarray(prior.mean), scenario=scenario)
+    state, beliefs = jax.jit(run, static_argnames=("config", "collect"))(
+        params,
+        init(prior, config=settings),
+        inputs,
+        landmarks=world.landmarks,
+        beam_angles=scenario.beam_angles(),
+        config=settings,
+        collect=_poses,
+    )
+    plotting.map_figure(
+        path,
+        np.asarray(state.log_odds),
+        settings.grid,
+        np.asarray(beliefs),
+        truth=np.asarray(truth.pose),
+        segments=np.asarray(world.segments),
+        title=f"Map of one run of {scenario.name}, made at the estimated poses",
+    )
+
+
+def _poses(state: Any, info: Any, aside: Any) -> jax.Array:
+    del state, aside
+    return info.belief.mean
+
+
+def _print(report: dict[str, Any]) -> None:
+    def band(name: str) -> str:
+        return "[{:.3f}, {:.3f}]".format(*report[name])
+
+    lag = report["innovation_lag_one"]
+    lag_band = report["innovation_lag_one_band_95"]
+    rows = [
+        ("ANEES (3 degrees)", f"{report['anees']:.3f}", f"{band('anees_band_95')} (spread between runs)"),
+        ("steps inside the NEES band", f"{100 * report['nees_steps_in_band']:.1f} %", "95 %"),
+        ("NIS (2 degrees)", f"{report['nis_mean']:.3f}", band("nis_band_95")),
+        *(
+            (f"{level} % ellipsoid holds", f"{100 * report[f'coverage_{level}']:.1f} %", f"{level} %")
+            for level in (50, 90, 95, 99)
+        ),
+        *(
+            (f"{axis} within ±2σ", f"{100 * share:.1f} %", "95.4 %")
+            for axis, share in report["within_two_sigma"].items()
+        ),
+        (
+            "innovation lag one",
+            f"{lag['range']:+.4f}, {lag['bearing']:+.4f}",
+            "nothing observed" if lag_band is None else f"±{lag_band:.4f}",
+        ),
+        (
+            "gate lets in",
+            f"{100 * report['gate_accept_rate']:.3f} %",
+            "100 %" if report["gate_nominal_rate"] is None else f"{100 * report['gate_nominal_rate']:g} %",
+        ),
+        ("position RMSE", f"{report['rmse_position_m']:.4f} m", ""),
+        ("yaw RMSE", f"{report['rmse_yaw_rad']:.4f} rad", ""),
+        ("diverged runs", str(report["diverged_runs"]), "0"),
+        ("flagged steps", str(report["flagged_steps"]), "0"),
+    ]
+    if "map" in report:
+        rows += [
+            ("map entropy", f"{report['map']['entropy_bits']:.0f} bits", ""),
+            ("map Brier score", f"{report['map']['brier']:.4f}", "0 is perfect, 0.25 knows nothing"),
+        ]
+    show(f"{report['scenario']}, {report['motion']} motion, {report['runs']} runs", rows)
+    CONSOLE.print(f"[bold]{report['verdict']}[/bold]", highlight=False)
+    CONSOLE.print(report["gate_verdict"], highlight=False)
+    CONSOLE.print(
+        f"{report['runs_per_s']:.0f} runs/s after {report['compile_s']:.1f} s of compilation", highlight=False
+    )
+
+
+if __name__ == "__main__":
+    command_line(main, ConsistencyConfig)

@@ -1,0 +1,252 @@
+"""Localise a robot on its log, and judge the filter against the truth where the log has one."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from common import CONSOLE, command_line, count_rows, output_folder, params_or, progress_bar, saved, show, write_report
+
+from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, consistency, init, plotting, run
+from jaxlocmap.logs import Log, Timeline, read, to_timeline, write_tum
+
+_PIECE = 2000  # steps between two moves of the progress bar
+
+# What the program believes of a log that states nothing: wheel commands (spectral density 0.1 m/s and 0.1 rad/s per
+# root second, over periods of 0.1 s) and a camera's landmarks.
+_DEFAULT_NOISE = {"v": 0.1 / 0.1**0.5, "w": 0.1 / 0.1**0.5, "range": 0.15, "bearing": 0.05}
+_PERIOD = 0.1  # s, what Q refers to
+_PRIOR_STD = (0.05, 0.05, 0.05)  # m, m, rad, around the pose to start from
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalizeConfig:
+    """Settings of the filter, and what it reads."""
+
+    log: tyro.conf.Positional[Path]
+    """The log: a file for woods, a folder for mrclam."""
+    format: Literal["woods", "mrclam"]
+    """How the log is written."""
+    robot: int | None = None
+    """Which robot of an mrclam log."""
+    params: Path | None = None
+    """JSON file of Q and R; by default the variances the log states, or what fits the format."""
+    motion: Literal["arc", "euler", "capstone"] = "arc"
+    """The filter's motion model."""
+    gate: float | None = 0.99
+    """Probability with which a good observation passes the gate; None for no gate."""
+    max_range: float | None = None
+    """Sightings at or beyond are left out, m."""
+    start: tuple[float, float, float] | None = None
+    """Pose to start from, m, m, rad; by default the first true pose."""
+    seed: int = 0
+    """Nothing here is random; every program has it."""
+    out: Path = Path("out/localize")
+    """Folder for report.json, the figures and the trajectories."""
+    quick: bool = False
+    """The first 2,000 steps alone."""
+
+
+def main(config: LocalizeConfig) -> dict[str, Any]:
+    """Run the filter over the log, write the report, the figures and the trajectories."""
+    out = output_folder(config.out)
+    log = read(config.log, config.format, config.robot)
+    if not len(log.landmarks):
+        raise ValueError(f"{config.log}: expected landmarks to localise by, got none (format {config.format})")
+    if config.start is None and not len(log.truth_time):
+        raise ValueError(f"start: {config.log} has no truth to start from: expected a pose X Y THETA, got None")
+    begin = float(log.truth_time.min()) if config.start is None else None
+    timeline = to_timeline(log, max_range=config.max_range, start=begin)
+    if config.quick:
+        timeline = _first(timeline, _PIECE)
+    with jax.enable_x64(True):
+        params = params_or(config.params, _believed(log))
+        settings = Config(
+            dt=_PERIOD, motion=config.motion, gate_probability=config.gate, sensor_offset=_offset(log.sensor_offset)
+        )
+        start = _first_pose(log, timeline) if config.start is None else np.array(config.start)
+        prior = Gaussian(jnp.asarray(start), jnp.diag(jnp.array(_PRIOR_STD) ** 2))
+        CONSOLE.print(f"{len(timeline.time)} steps of {log.name}; compiling takes some seconds")
+        info = _run(params, prior, timeline.inputs, log.landmarks, settings)
+        report = _judge(log, timeline, info, settings)
+    report["params"] = {name: np.asarray(value).tolist() for name, value in params._asdict().items()}
+    _write(out, log, timeline, info, report)
+    return report
+
+
+def _first_pose(log: Log, timeline: Timeline) -> np.ndarray:
+    if not timeline.truth_valid[0]:
+        raise ValueError(
+            f"start: {log.name} has no truth at its first step, {timeline.time[0]:.3f} s: expected a pose X Y THETA"
+        )
+    return timeline.truth[0]
+
+
+def _offset(offset: np.ndarray) -> tuple[float, float, float]:
+    dx, dy, dtheta = (float(x) for x in offset)
+    return dx, dy, dtheta
+
+
+def _first(timeline: Timeline, steps: int) -> Timeline:
+    """The same timeline, cut short."""
+    cut = jax.tree.map(lambda x: x[:steps], timeline._replace(counts={}))
+    return cut._replace(counts=timeline.counts)
+
+
+def _believed(log: Log) -> Params:
+    stated = log.stated_variance
+    deviations = _DEFAULT_NOISE if stated is None else {name: value**0.5 for name, value in stated.items()}
+    return Params.from_std(**deviations)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _piece(params: Params, state: State, inputs: Inputs, landmarks: jax.Array, *, config: Config) -> tuple[State, Info]:
+    return run(params, state, inputs, landmarks=landmarks, config=config)
+
+
+def _run(params: Params, prior: Gaussian, inputs: Inputs, landmarks: np.ndarray, config: Config) -> Info:
+    """`run`, in equal pieces so that a bar can move. The last is filled up with steps of no time and no sightings,
+    which change nothing.
+    """
+    steps = len(inputs.dt)
+    fill = -steps % _PIECE
+    padded = jax.tree.map(lambda x: np.concatenate([x, np.zeros((fill, *x.shape[1:]), x.dtype)]), inputs)
+    state, reports = init(prior, config=config), []
+    with progress_bar("filtering", steps) as progress:
+        for begin in range(0, steps, _PIECE):
+            piece = jax.tree.map(lambda x, begin=begin: x[begin : begin + _PIECE], padded)
+            state, info = _piece(params, state, piece, landmarks, config=config)
+            reports.append(jax.tree.map(np.asarray, info))
+            progress(min(begin + _PIECE, steps))
+    return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:steps], *reports)
+
+
+def _judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str, Any]:
+    valid = timeline.inputs.valid
+    observations = int(valid.sum())
+    rate = float(info.accepted.sum()) / observations if observations else float("nan")
+    report: dict[str, Any] = {
+        "log": log.name,
+        "steps": len(timeline.time),
+        "duration_s": float(timeline.time[-1] - timeline.time[0]),
+        "observations": observations,
+        "gate_accept_rate": rate,
+        "gate_nominal_rate": config.gate_probability,
+        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability),
+        "longest_rejection": _longest_rejection(np.asarray(valid), np.asarray(info.accepted)),
+        "nis_mean": float(info.nis[valid].mean()) if observations else None,
+        "innovation_lag_one": _whiteness(log, timeline, info),
+        "flagged_steps": int((~info.ok).sum()),
+        "log_likelihood": float(info.log_likelihood.sum()),
+        "counts": timeline.counts,
+        "truth_share": float(timeline.truth_valid.mean()),
+    }
+    nees, error = _score(timeline, info)
+    scored = nees[np.isfinite(nees)]
+    if not len(scored):
+        nothing = ("rmse_position_m", "rmse_yaw_rad", "anees", "anees_at_sightings", "nees_median")
+        levels = (f"coverage_{round(100 * level)}" for level in consistency.COVERAGE_LEVELS)
+        report |= dict.fromkeys((*nothing, *levels))
+        return report | {"verdict": "no truth: the covariance cannot be judged", "nees": nees}
+    at_sightings = nees[valid.any(axis=1) & np.isfinite(nees)]
+    return report | {
+        "rmse_position_m": float(np.sqrt(np.nanmean(np.sum(error[:, :2] ** 2, axis=1)))),
+        "rmse_yaw_rad": float(np.sqrt(np.nanmean(error[:, 2] ** 2))),
+        "anees": float(scored.mean()),
+        "anees_at_sightings": float(at_sightings.mean()) if len(at_sightings) else None,
+        "nees_median": float(np.median(scored)),
+        **{f"coverage_{round(100 * level)}": share for level, share in consistency.shares_below(scored).items()},
+        "verdict": consistency.verdict(float(scored.mean())),
+        "nees": nees,
+    }
+
+
+def _score(timeline: Timeline, info: Info) -> tuple[np.ndarray, np.ndarray]:
+    """NEES (T,) and pose errors (T, 3), NaN where there is no truth."""
+    error = jax.vmap(consistency.pose_error)(jnp.asarray(timeline.truth), jnp.asarray(info.belief.mean))
+    nees = jax.vmap(consistency.nees)(error, jnp.asarray(info.belief.cov))
+    return np.asarray(nees), np.asarray(error)
+
+
+def _longest_rejection(valid: np.ndarray, accepted: np.ndarray) -> int:
+    """The longest streak of observations that the gate refused one after the other."""
+    refused = ~accepted[valid]
+    breaks = np.flatnonzero(~refused)
+    edges = np.concatenate([[-1], breaks, [len(refused)]])
+    return int(np.max(np.diff(edges)) - 1)
+
+
+def _whiteness(log: Log, timeline: Timeline, info: Info) -> dict[str, float | None]:
+    """Correlation of successive innovations of the same landmark, with its band."""
+    step, slot = np.nonzero(timeline.inputs.valid)
+    if not len(step):
+        return {"range": None, "bearing": None, "band_95": None}
+    white = jax.vmap(consistency.whiten)(jnp.asarray(info.innovation[step, slot]), jnp.asarray(info.S[step, slot]))
+    landmark = timeline.inputs.landmark[step, slot]
+    columns = np.zeros((len(timeline.time), len(log.landmarks), 2))
+    seen = np.zeros(columns.shape[:2], bool)
+    columns[step, landmark], seen[step, landmark] = white, True
+    products, squares, pairs = consistency.lag_one(jnp.asarray(columns), jnp.asarray(seen))
+    if not pairs:
+        return {"range": None, "bearing": None, "band_95": None}
+    correlation = products / squares
+    return {"range": float(correlation[0]), "bearing": float(correlation[1]), "band_95": 1.96 / float(pairs) ** 0.5}
+
+
+def _write(out: Path, log: Log, timeline: Timeline, info: Info, report: dict[str, Any]) -> None:
+    nees = report.pop("nees")
+    write_report(out, report)
+    write_tum(out / "estimate.tum", timeline.time, info.belief.mean)
+    files = ["report.json", "trajectory.png", "estimate.tum"]
+    known = timeline.truth_valid
+    judged = report["anees"] is not None
+    if judged:
+        write_tum(out / "truth.tum", timeline.time[known], timeline.truth[known])
+        plotting.log_nees_figure(out / "nees.png", timeline.time, nees, report)
+        files += ["truth.tum", "nees.png"]
+    plotting.trajectory_figure(
+        out / "trajectory.png",
+        np.asarray(info.belief.mean),
+        np.asarray(info.belief.cov),
+        timeline.truth if judged else None,
+        landmarks=log.landmarks,
+        title=f"{log.name}: position RMSE {report['rmse_position_m']:.3f} m" if judged else log.name,
+    )
+    _print(report, judged)
+    saved(out, *files)
+
+
+def _print(report: dict[str, Any], judged: bool) -> None:
+    lag = report["innovation_lag_one"]
+    nominal = report["gate_nominal_rate"]
+    rows = [
+        ("steps, observations", f"{report['steps']}, {report['observations']}", ""),
+        ("gate lets in", f"{100 * report['gate_accept_rate']:.1f} %", f"{100 * (nominal or 1):g} %"),
+        ("longest streak refused", f"{report['longest_rejection']} observations", ""),
+        ("NIS (2 degrees)", "–" if report["nis_mean"] is None else f"{report['nis_mean']:.3f}", "2"),
+    ]
+    if lag["band_95"] is not None:
+        rows.append(("innovation lag one", f"{lag['range']:+.3f}, {lag['bearing']:+.3f}", f"±{lag['band_95']:.3f}"))
+    if judged:
+        rows += [
+            ("position RMSE", f"{report['rmse_position_m']:.3f} m", ""),
+            ("yaw RMSE", f"{report['rmse_yaw_rad']:.3f} rad", ""),
+            ("ANEES (3 degrees)", f"{report['anees']:.3g}", "3"),
+            ("ANEES at sightings", f"{report['anees_at_sightings'] or float('nan'):.3g}", "3"),
+            ("median NEES", f"{report['nees_median']:.3g}", f"{consistency.chi2_quantile(0.5, 3):.2f}"),
+            ("95 % ellipsoid holds", f"{100 * report['coverage_95']:.1f} %", "95 %"),
+            ("steps with truth", f"{100 * report['truth_share']:.1f} %", ""),
+        ]
+    show(report["log"], rows + count_rows(report["counts"]))
+    CONSOLE.print(f"[bold]{report['verdict']}[/bold]", highlight=False)
+    CONSOLE.print(report["gate_verdict"], highlight=False)
+
+
+if __name__ == "__main__":
+    command_line(main, LocalizeConfig)

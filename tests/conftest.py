@@ -1,0 +1,88 @@
+"""The strict session: float64 by default, no silent change of rank or dtype; pyproject turns warnings into errors.
+
+JAXLOCMAP_X64=0 makes it the float32 job: tests that need float64 skip, the rest hold to float32 tolerances.
+"""
+
+import os
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from hypothesis import settings
+
+from jaxlocmap import Config, Gaussian, GridSpec, Inputs, Params
+
+X64 = os.environ.get("JAXLOCMAP_X64", "1") != "0"
+jax.config.update("jax_enable_x64", X64)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# The same examples in every run; compiling takes longer than the default deadline.
+settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+settings.load_profile("repeatable")
+
+
+@pytest.fixture
+def x64():
+    """Skip the test, visibly, in the float32 job."""
+    if not X64:
+        pytest.skip("needs float64, this is the float32 job")
+
+
+@pytest.fixture(scope="session")
+def tolerance():
+    """Picks the tolerance of the job's precision: `tolerance(double, single)`."""
+    return lambda double, single: double if X64 else single
+
+
+class Course(NamedTuple):
+    """The course's run, ready for the library: what its robot measured and what its filter believed."""
+
+    params: Params
+    prior: Gaussian
+    inputs: Inputs
+    landmarks: jax.Array
+    beam_angles: jax.Array
+    grid: GridSpec
+
+    def config(self, *, motion="arc", mapping=False, **kwargs):
+        return Config(dt=reference.COURSE_DT, motion=motion, grid=self.grid if mapping else None, **kwargs)
+
+    def first(self, steps):
+        """The same with the first steps only, and without scans."""
+        return self._replace(inputs=jax.tree.map(lambda x: x[:steps], self.inputs._replace(ranges=None)))
+
+
+@pytest.fixture(scope="session")
+def course():
+    measured = reference.course_run()
+    scan = reference.COURSE_SCAN
+    return Course(
+        params=Params(
+            Q=jnp.array(reference.COURSE_Q),
+            R=jnp.array(reference.COURSE_R),
+            l_occ=jnp.array(scan["l_occ"]),
+            l_free=jnp.array(scan["l_free"]),
+        ),
+        prior=Gaussian(jnp.array(reference.COURSE_PRIOR_MEAN), jnp.array(reference.COURSE_PRIOR_COV)),
+        inputs=Inputs(
+            dt=jnp.array(measured["dt"]),
+            control=jnp.array(measured["control"]),
+            landmark=jnp.array(measured["landmark"].astype(np.int32)),
+            z=jnp.array(measured["z"]),
+            valid=jnp.array(measured["valid"]),
+            ranges=jnp.array(measured["scans"]),
+        ),
+        landmarks=jnp.array(reference.COURSE_LANDMARKS),
+        beam_angles=jnp.array(reference.COURSE_ANGLES),
+        grid=GridSpec(
+            origin=scan["origin"],
+            resolution=scan["resolution"],
+            shape=reference.COURSE_GRID_SHAPE,
+            l_min=scan["l_min"],
+            l_max=scan["l_max"],
+        ),
+    )

@@ -1,0 +1,246 @@
+"""Predict, update and gate against the reference and the textbook Kalman filter; what covariances must never do."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxlocmap import Config, Gaussian, Inputs, Params, ekf, init, motion, run
+
+MEAN = np.array([0.4, -0.3, 3.1])
+COV = np.array([[0.05, 0.01, 0.004], [0.01, 0.04, -0.003], [0.004, -0.003, 0.02]])
+Q = np.array([[0.02, 0.003], [0.003, 0.05]])
+R = np.diag([0.15**2, 0.03**2])
+
+
+def near(got, expected, atol):
+    np.testing.assert_allclose(np.asarray(got, float), expected, atol=atol, rtol=atol)
+
+
+# --- predict
+
+
+@pytest.mark.parametrize("name", ["euler", "arc", "capstone"])
+@pytest.mark.parametrize("dt", [0.0, 0.03, 0.1, 0.7])
+def test_predict_is_the_reference(name, dt, tolerance):
+    control = np.array([0.6, -0.8])
+    mean, cov = ekf.predict(
+        jnp.array(MEAN),
+        jnp.array(COV),
+        jnp.array(control),
+        jnp.array(dt),
+        jnp.array(Q),
+        motion=motion.resolve(name),
+        nominal_dt=0.1,
+    )
+    expected_mean, expected_cov = reference.predict(MEAN, COV, control, dt, Q, reference.MOTION[name], 0.1)
+    near(mean, expected_mean, tolerance(1e-14, 1e-6))
+    near(cov, expected_cov, tolerance(1e-15, 1e-7))
+    np.testing.assert_array_equal(cov, cov.T)
+
+
+def added(dt, steps, omega):
+    """What `steps` steps of dt add to no uncertainty, first-order model, nominal period 0.1 s."""
+    mean, cov = jnp.array(MEAN), jnp.zeros((3, 3))
+    for _ in range(steps):
+        control = jnp.array([0.6, omega])
+        mean, cov = ekf.predict(
+            mean, cov, control, jnp.array(dt), jnp.array(Q), motion=motion.EULER, nominal_dt=0.1
+        )
+    return np.asarray(cov)
+
+
+def test_a_step_of_no_length_adds_nothing():
+    np.testing.assert_array_equal(added(0.0, 1, 0.5), np.zeros((3, 3)))
+
+
+def test_a_nominal_step_adds_G_Q_G_transposed(tolerance):
+    _, _, G = reference.euler(MEAN, np.array([0.6, 0.5]), 0.1)
+    near(added(0.1, 1, 0.5), G @ Q @ G.T, tolerance(1e-17, 1e-9))
+
+
+def test_two_half_steps_add_as_much_heading_noise_as_one_whole(tolerance):
+    """Nothing moves the heading but omega, so for it the equality is exact."""
+    near(added(0.05, 2, 0.5)[2, 2], added(0.1, 1, 0.5)[2, 2], tolerance(1e-17, 1e-9))
+
+
+def test_many_short_steps_add_as_much_noise_as_one_whole_to_first_order():
+    """Heading noise of a part step reaches the position as v dt: the gap falls with dt, and is that lever's size."""
+    gaps = []
+    for dt in (0.1, 0.01):
+        whole, halves = added(dt, 1, 0.0), added(dt / 2, 2, 0.0)
+        gaps.append(np.abs(halves - whole).max() / np.abs(whole).max())
+    assert gaps[0] < 0.6 * 0.1  # v dt
+    assert gaps[1] < 0.15 * gaps[0]
+
+
+def test_the_noise_of_a_second_does_not_depend_on_the_rate():
+    """A Q of a tenth of a second: a thousand steps of 1 ms add to the heading what ten nominal ones add."""
+    assert added(0.005, 20, 0.3)[2, 2] == pytest.approx(added(0.1, 1, 0.3)[2, 2], rel=1e-5)
+
+
+# --- gate
+
+
+def test_gate_threshold_is_the_chi_square_quantile():
+    assert ekf.gate_threshold(0.99, 2) == pytest.approx(9.2103, abs=5e-5)  # -2 ln 0.01
+    for p in (0.5, 0.95, 0.999):
+        for dimension in (1, 2, 3):
+            assert ekf.gate_threshold(p, dimension) == pytest.approx(scipy.stats.chi2.ppf(p, dimension), rel=1e-12)
+
+
+def test_no_gate_lets_everything_in():
+    assert ekf.gate_threshold(None, 2) == math.inf
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, 2.0, math.nan])
+def test_a_gate_that_is_no_probability_is_refused(probability):
+    with pytest.raises(ValueError, match=r"gate probability: expected a value inside \(0, 1\), got"):
+        ekf.gate_threshold(probability, 2)
+
+
+@pytest.mark.parametrize(("distance", "accepted"), [(7.4, True), (9.2, True), (9.22, False), (9.3, False)])
+def test_course_problem_4_the_99_percent_gate_in_two_dimensions(distance, accepted):
+    """d2 = 7.4 is let in, 9.3 is not: the threshold is 9.2103."""
+    S = COV[:2, :2] + R
+    residual = np.linalg.cholesky(S) @ np.array([math.sqrt(distance), 0.0])
+    update = ekf.update(
+        jnp.array(MEAN),
+        jnp.array(COV),
+        jnp.array(residual),
+        jnp.eye(2, 3),
+        jnp.array(R),
+        threshold=ekf.gate_threshold(0.99, 2),
+    )
+    assert float(update.nis) == pytest.approx(distance, rel=1e-5)
+    assert bool(update.accepted) == accepted
+    assert bool(np.all(update.mean == jnp.array(MEAN))) != accepted
+    assert bool(np.all(update.cov == jnp.array(COV))) != accepted
+
+
+# --- update
+
+
+@pytest.mark.parametrize("gate", [None, 0.25])
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.2, -0.1, 0.4)])
+def test_correct_is_the_reference(gate, offset, tolerance):
+    z, landmark = np.array([3.4, -2.9]), np.array([3.0, 2.0])
+    got = ekf.correct(
+        *(jnp.array(x) for x in (MEAN, COV, z, landmark, R)),
+        threshold=math.inf if gate is None else gate,
+        sensor_offset=offset,
+    )
+    expected = reference.correct(MEAN, COV, z, landmark, R, gate, offset)
+    for field, value in zip(got, expected, strict=True):
+        near(field, value, tolerance(1e-12, 2e-5))  # S⁻¹ magnifies by up to 100
+    assert bool(got.accepted) == (gate is None)
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_a_linear_model_is_the_textbook_kalman_filter(m, tolerance):
+    """Any linear sensor of dimension m, ten observations in turn: K = P Hᵀ (H P Hᵀ + R)⁻¹, P ← (I − K H) P."""
+    rng = np.random.default_rng(m)
+    H, root = rng.normal(size=(m, 3)), rng.normal(size=(m, m))
+    noise = root @ root.T + 0.1 * np.eye(m)
+    mean, cov = np.array([0.2, -0.1, 0.05]), COV
+    got = ekf.Update(jnp.array(mean), jnp.array(cov), *[None] * 5)
+    update = jax.jit(ekf.update)
+    for z in rng.normal(size=(10, m)) * 0.1:
+        residual = jnp.array(z) - jnp.array(H) @ got.mean
+        got = update(got.mean, got.cov, residual, jnp.array(H), jnp.array(noise))
+        innovation, S = z - H @ mean, H @ cov @ H.T + noise
+        K = cov @ H.T @ np.linalg.inv(S)
+        mean, cov = mean + K @ innovation, (np.eye(3) - K @ H) @ cov
+        atol = tolerance(1e-13, 1e-5)
+        near(got.mean, mean, atol)
+        near(got.cov, cov, atol)
+        near(got.innovation, innovation, atol)
+        near(got.S, S, tolerance(1e-13, 1e-5))
+        near(got.nis, innovation @ np.linalg.solve(S, innovation), tolerance(1e-12, 1e-4))
+        density = scipy.stats.multivariate_normal(np.zeros(m), S)
+        near(got.log_likelihood, density.logpdf(innovation), tolerance(1e-12, 1e-4))
+
+
+def test_an_update_that_is_not_valid_leaves_the_belief_bit_for_bit():
+    args = [jnp.array(x) for x in (MEAN, COV, np.array([0.1, 0.2]), np.eye(2, 3), R)]
+    update = ekf.update(*args, valid=False)
+    assert not update.accepted
+    np.testing.assert_array_equal(update.mean, args[0])
+    np.testing.assert_array_equal(update.cov, args[1])
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_residual_that_is_no_number_never_passes_even_without_a_gate(bad):
+    args = [jnp.array(x) for x in (MEAN, COV, np.array([bad, 0.2]), np.eye(2, 3), R)]
+    update = ekf.update(*args)
+    assert not update.accepted
+    np.testing.assert_array_equal(update.mean, args[0])
+
+
+def test_a_landmark_on_the_sensor_is_not_accepted():
+    args = [jnp.array(x) for x in (MEAN, COV, np.array([1.0, 0.0]), MEAN[:2], R)]
+    update = ekf.correct(*args)
+    assert not update.accepted
+    np.testing.assert_array_equal(update.mean, args[0])
+
+
+# --- course problem 2: a Joseph update of a positive semi-definite matrix is one
+
+joseph = jax.jit(lambda P, H, R: ekf.update(jnp.zeros(3), P, jnp.zeros(len(R)), H, R).cov)
+
+
+@given(
+    seed=st.integers(0, 100_000),
+    rank=st.sampled_from([1, 2, 3]),
+    spread=st.sampled_from([1.0, 1e-3, 1e-6]),
+    precision=st.sampled_from([1.0, 1e-3, 1e-6]),
+)
+def test_course_problem_2_joseph_stays_positive_semi_definite(seed, rank, spread, precision, tolerance):
+    """Also for a P without full rank, axes of very unequal size, and a sensor far sharper than P."""
+    rng = np.random.default_rng(seed)
+    A = np.diag([1.0, spread, 1.0]) @ rng.normal(size=(3, rank))
+    root = rng.normal(size=(2, 2))
+    noise = precision * (root @ root.T + 1e-3 * np.eye(2))
+    cov = np.asarray(joseph(jnp.array(A @ A.T), jnp.array(rng.normal(size=(2, 3))), jnp.array(noise)), np.float64)
+    np.testing.assert_array_equal(cov, cov.T)
+    # Both terms are squares, so what is below zero is rounding of the prior's size, and of K where S is near singular.
+    assert np.linalg.eigvalsh(cov)[0] >= -tolerance(1e-13, 1e-4) * np.linalg.eigvalsh(A @ A.T)[-1]
+
+
+def test_positive_semi_definite_after_100_000_float32_steps():
+    """A robot on a circle that sees a landmark sharply every step, for 10,000 s: float32 rounding must not add up."""
+    steps, f32 = 100_000, np.float32
+    heading = 0.3 * 0.1 * np.arange(1, steps + 1)
+    truth = np.column_stack([np.sin(heading) / 0.3, (1 - np.cos(heading)) / 0.3, heading])
+    marks = np.array([[0.0, 8.0], [-5.0, -3.0]])
+    which = np.arange(steps) % 2
+    to = marks[which] - truth[:, :2]
+    z = np.column_stack([np.hypot(*to.T), reference.wrap(np.arctan2(to[:, 1], to[:, 0]) - heading)])
+    inputs = Inputs(
+        dt=jnp.full(steps, 0.1, f32),
+        control=jnp.broadcast_to(jnp.array([1.0, 0.3], f32), (steps, 2)),
+        landmark=jnp.array(which[:, None], jnp.int32),
+        z=jnp.array(z[:, None], f32),
+        valid=jnp.ones((steps, 1), bool),
+    )
+    params = Params(*(jnp.array(x, f32) for x in (np.diag([0.02**2, 0.03**2]), np.diag([0.01**2, 1e-3**2]), 0.8, -0.4)))
+    prior = Gaussian(jnp.zeros(3, f32), jnp.diag(jnp.array([1.0, 1.0, 1.0], f32)))
+    config = Config(dt=0.1)
+    keep = jax.jit(
+        functools.partial(run, config=config, landmarks=jnp.array(marks, f32), collect=lambda s, i, _: (i.ok, i.belief))
+    )
+    _, (ok, belief) = keep(params, init(prior, config=config), inputs)
+    cov = np.asarray(belief.cov, np.float64)
+    assert belief.cov.dtype == f32
+    assert bool(jnp.all(ok))
+    np.testing.assert_array_equal(cov, np.swapaxes(cov, 1, 2))
+    assert np.linalg.eigvalsh(cov).min() > 0
+    error = np.asarray(belief.mean, np.float64) - truth
+    assert np.abs(error[:, :2]).max() < 0.05  # and it is a filter still: 5 standard deviations of the sensor's range

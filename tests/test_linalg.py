@@ -1,0 +1,100 @@
+"""Unrolled matrices against NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxlocmap.linalg import Matrix, forward, is_psd, ldl, mahalanobis, sandwich, solve
+
+
+def random_psd(rng, n, rank=None):
+    A = rng.normal(size=(n, rank or n))
+    return A @ A.T
+
+
+def dense(matrix):
+    return np.array([[float(x) for x in row] for row in matrix.rows])
+
+
+def entries(n, m):
+    """n x m numbers of which many are structure: the integers 0, 1 and -1."""
+    entry = st.one_of(st.sampled_from([0, 1, -1]), st.floats(-4, 4, width=32))
+    return st.lists(st.lists(entry, min_size=m, max_size=m), min_size=n, max_size=n)
+
+
+@given(a=entries(3, 2), b=entries(2, 3), c=entries(3, 3))
+def test_products_sums_and_transposes_are_numpys_whatever_is_structure(a, b, c):
+    result = (Matrix(a) @ Matrix(b) - Matrix(c) + Matrix(c).T.scale(-1)).T
+    expected = (np.array(a) @ np.array(b) - np.array(c) - np.array(c).T).T
+    np.testing.assert_allclose(dense(result), expected, rtol=1e-12, atol=1e-12)  # Python floats: a few roundings
+
+
+def test_structure_leaves_no_trace_in_the_program():
+    shear = Matrix([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    jaxpr = jax.make_jaxpr(lambda P: sandwich(shear, Matrix.of(P)).array(P.dtype))(jnp.eye(3))
+    assert not {"mul", "add", "dot_general"} & {eqn.primitive.name for eqn in jaxpr.eqns}
+
+
+def test_sandwich_is_the_product_and_symmetric_to_the_last_bit(tolerance):
+    rng = np.random.default_rng(0)
+    A, P = rng.normal(size=(3, 3)), random_psd(rng, 3)
+    result = np.asarray(sandwich(Matrix.of(jnp.array(A)), Matrix.symmetric(jnp.array(P))).array(float))
+    np.testing.assert_array_equal(result, result.T)
+    np.testing.assert_allclose(result, A @ P @ A.T, rtol=tolerance(1e-13, 1e-5))
+
+
+def test_symmetric_reads_the_upper_triangle():
+    np.testing.assert_array_equal(dense(Matrix.symmetric(np.array([[1.0, 2.0], [9.0, 3.0]]))), [[1, 2], [2, 3]])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_factor_and_solves_are_numpys(n, tolerance):
+    rng = np.random.default_rng(n)
+    S, b = random_psd(rng, n) + np.eye(n), rng.normal(size=n)
+    rtol = tolerance(1e-12, 1e-4)  # condition of S is below 100
+    L, D = ldl(Matrix.of(jnp.array(S)))
+    r = tuple(jnp.array(b))
+    np.testing.assert_allclose(dense(L) @ np.diag(D) @ dense(L).T, S, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(dense(L) @ np.array(forward(L, r)), b, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(np.array(solve(L, D, r)), np.linalg.solve(S, b), rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(mahalanobis(Matrix.of(jnp.array(S)), r), b @ np.linalg.solve(S, b), rtol=rtol)
+
+
+def psd(P):
+    return bool(is_psd(Matrix.of(jnp.asarray(P, float))))
+
+
+@given(seed=st.integers(0, 10_000), rank=st.sampled_from([1, 2, 3]), scale=st.sampled_from([1e-6, 1.0, 1e6]))
+def test_semi_definite_matrices_pass_singular_or_not_in_any_unit(seed, rank, scale):
+    rng = np.random.default_rng(seed)
+    units = np.diag([scale, 1.0, 1.0])
+    assert psd(units @ random_psd(rng, 3, rank) @ units)
+
+
+@given(seed=st.integers(0, 10_000), scale=st.sampled_from([1e-3, 1.0, 1e3]))
+def test_a_clearly_negative_eigenvalue_is_seen(seed, scale):
+    """One eigenvalue a hundredth of the largest below zero; the check allows for rounding only."""
+    rng = np.random.default_rng(seed)
+    V, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    units = np.diag([scale, 1.0, 1.0])
+    assert not psd(units @ V @ np.diag([1.0, rng.uniform(0.0, 1.0), -0.01]) @ V.T @ units)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("place", [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
+def test_a_matrix_with_an_entry_that_is_no_number_is_refused(bad, place):
+    P = np.eye(3)
+    P[place] = P[place[::-1]] = bad
+    assert not psd(P)
+
+
+@pytest.mark.parametrize("diagonal", [(-1, 1, 1), (1, -1, 1), (1, 1, -1), (-1, -1, 1)])
+def test_a_negative_variance_is_refused(diagonal):
+    assert not psd(np.diag(np.array(diagonal, float)))
+
+
+def test_no_uncertainty_at_all_is_semi_definite():
+    assert psd(np.zeros((3, 3)))

@@ -1,0 +1,184 @@
+"""Motion models against the reference, their Jacobians against forward-mode differentiation, angles, wheels."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxlocmap import ekf, motion
+from jaxlocmap.linalg import Matrix
+
+OMEGAS = (0.0, 1e-9, -1e-9, 1e-4, 0.3, -0.3, 40.0)
+PERIODS = (0.0, 1e-3, 0.1, 1.0)
+SWITCH = 0.25  # |omega dt / 2| where the series takes over
+
+
+def cases():
+    """(pose, control, dt) of every yaw rate with every period, and of both sides of the series' switch."""
+    rows = [(w, dt) for w in OMEGAS for dt in PERIODS]
+    rows += [(side * 2 * SWITCH * (1 + off) / 0.1, 0.1) for side in (1, -1) for off in (-1e-3, -1e-7, 0, 1e-7, 1e-3)]
+    rng = np.random.default_rng(0)
+    poses = np.column_stack([rng.normal(size=(len(rows), 2)), rng.uniform(-np.pi, np.pi, len(rows))])
+    controls = np.column_stack([rng.uniform(-1, 1, len(rows)), [w for w, _ in rows]])
+    return poses, controls, np.array([dt for _, dt in rows])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.vmap, in_axes=(None, 0, 0, 0))
+def moved_and_jacobians(name, pose, control, dt):
+    model = motion.resolve(name)
+    F, G = model.jacobians(pose, control, dt)
+    by_jax = jax.jacfwd(model.transition, argnums=(0, 1))(pose, control, dt)
+    return model.transition(pose, control, dt), (F.array(pose.dtype), G.array(pose.dtype)), by_jax
+
+
+def library(name):
+    return jax.tree.map(np.asarray, moved_and_jacobians(name, *(jnp.array(x) for x in cases())))
+
+
+@pytest.mark.parametrize("name", ["euler", "arc", "capstone"])
+def test_transition_and_jacobians_are_the_reference(name, tolerance):
+    expected = [reference.MOTION[name](*case) for case in zip(*cases(), strict=True)]
+    got, (F, G), _ = library(name)
+    # A few roundings of entries of order 1; the course's model drops a turn of less than 1e-6 rad/s, here 1e-9.
+    atol = tolerance(2e-9 if name == "capstone" else 1e-14, 1e-5)
+    error = got - np.array([e[0] for e in expected])
+    error[:, 2] = reference.wrap(error[:, 2])
+    np.testing.assert_allclose(error, 0, atol=atol)
+    np.testing.assert_allclose(F, [e[1] for e in expected], atol=atol)
+    np.testing.assert_allclose(G, [e[2] for e in expected], atol=atol)
+
+
+@pytest.mark.parametrize("name", ["euler", "arc"])
+def test_jacobians_are_the_derivatives_of_the_transition(name, tolerance):
+    _, (F, G), (F_jax, G_jax) = library(name)
+    atol = tolerance(1e-14, 2e-6)  # a few roundings of entries of order 1
+    np.testing.assert_allclose(F, F_jax, atol=atol)
+    np.testing.assert_allclose(G, G_jax, atol=atol)
+
+
+def test_from_transition_predicts_as_the_analytic_model(tolerance):
+    pose, control, dt = jnp.array([0.3, -0.2, 3.1]), jnp.array([0.5, 0.7]), jnp.array(0.2)
+    cov = jnp.array([[0.04, 0.01, 0.002], [0.01, 0.05, 0.003], [0.002, 0.003, 0.01]])
+    Q = jnp.array([[0.02, 0.001], [0.001, 0.03]])
+    own = motion.from_transition(motion.ARC.transition)
+    one, other = (ekf.predict(pose, cov, control, dt, Q, motion=m, nominal_dt=0.1) for m in (own, motion.ARC))
+    for got, expected in zip(one, other, strict=True):
+        np.testing.assert_allclose(got, expected, atol=tolerance(1e-15, 1e-7))
+
+
+@pytest.mark.parametrize("omega", OMEGAS)
+def test_two_half_arcs_are_the_whole_arc(omega, tolerance):
+    pose, control = jnp.array([1.0, 2.0, -0.5]), jnp.array([0.8, omega])
+    half = motion.ARC.transition(motion.ARC.transition(pose, control, 0.05), control, 0.05)
+    np.testing.assert_allclose(half, motion.ARC.transition(pose, control, 0.1), atol=tolerance(1e-15 * 8, 1e-6))
+
+
+def test_first_order_model_tends_to_the_arc(tolerance):
+    """The two differ by v omega dt² / 2 at most to leading order, so by a hundredth at a tenth of the period."""
+    pose, control = jnp.array([0.0, 0.0, 0.4]), jnp.array([1.0, 1.0])
+    gap = [
+        np.abs(motion.ARC.transition(pose, control, dt) - motion.EULER.transition(pose, control, dt)).max()
+        for dt in (0.1, 0.01)
+    ]
+    assert gap[0] < 0.5 * 0.1**2 * 1.1
+    assert gap[1] / gap[0] == pytest.approx(0.01, rel=tolerance(0.1, 0.2))
+
+
+# --- angles
+
+EDGE = float(jnp.pi)
+
+
+def ulps(count):
+    """So many roundings of an angle of pi."""
+    return count * float(np.spacing(np.asarray(EDGE, jnp.result_type(float))))
+
+
+@given(angle=st.floats(-50.0, 50.0))
+def test_wrap_lands_in_the_circle_on_the_same_angle(angle):
+    wrapped = float(motion.wrap(jnp.array(angle)))
+    assert -EDGE - ulps(1) <= wrapped <= EDGE + ulps(1)
+    turns = (float(jnp.array(angle)) - wrapped) / (2 * math.pi)
+    # An angle of 50 carries 16 times the rounding of pi, and so does the multiple of 2 pi taken off it.
+    assert abs(turns - round(turns)) * 2 * math.pi <= ulps(32)
+
+
+@given(angle=st.floats(-EDGE, EDGE, allow_subnormal=False))
+def test_wrap_leaves_an_angle_inside_as_it_is(angle):
+    angle = jnp.array(angle)
+    if float(angle) < EDGE - ulps(2):
+        assert float(motion.wrap(angle)) == float(angle)
+
+
+@pytest.mark.parametrize("angle", [-EDGE, EDGE, np.nextafter(EDGE, 0), 3 * EDGE, -3 * EDGE, 5 * EDGE, -7 * EDGE])
+def test_wrap_at_the_seam_is_pi_from_zero(angle):
+    assert abs(abs(float(motion.wrap(jnp.array(angle)))) - EDGE) <= ulps(8)  # 7 pi carries 8 roundings of pi
+
+
+def test_wrap_has_derivative_one_everywhere():
+    for angle in (0.0, 3.0, EDGE, -EDGE, 9.0):
+        assert float(jax.grad(motion.wrap)(jnp.array(angle))) == 1.0
+
+
+@pytest.mark.parametrize("name", ["euler", "arc", "capstone"])
+def test_a_robot_that_turns_round_and_round_keeps_its_heading_inside(name, tolerance):
+    """300 steps of 0.4 rad: 19 turns."""
+    control, dt = jnp.array([0.1, 4.0]), jnp.array(0.1)
+    model = motion.resolve(name)
+
+    def turn(pose, _):
+        pose = model.transition(pose, control, dt)
+        return pose, pose[2]
+
+    _, headings = jax.lax.scan(turn, jnp.zeros(3), length=300)
+    assert np.all(np.abs(headings) <= EDGE + ulps(1))
+    error = reference.wrap(np.asarray(headings) - 0.4 * np.arange(1, 301))
+    np.testing.assert_allclose(error, 0, atol=tolerance(1e-12, 3e-4))  # 300 roundings of pi, at most 3 ulps a step
+
+
+# --- models by name, wheels
+
+
+def test_an_unknown_model_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"motion: expected one of \['arc', 'capstone', 'euler'\].*got 'ackermann'"):
+        motion.resolve("ackermann")
+
+
+def test_a_model_passes_through():
+    assert motion.resolve(motion.EULER) is motion.EULER
+
+
+def test_wheels_and_control_are_inverse(tolerance):
+    control = jnp.array(np.random.default_rng(0).normal(size=(4, 5, 2)))
+    back = motion.from_wheels(*motion.to_wheels(control, 0.4), 0.4)
+    np.testing.assert_allclose(back, control, atol=tolerance(1e-14, 2e-6))
+
+
+def test_a_faster_right_wheel_turns_left():
+    np.testing.assert_allclose(motion.from_wheels(jnp.array(0.4), jnp.array(0.6), 0.5), [0.5, 0.4], rtol=1e-6)
+
+
+def test_a_gyro_takes_the_place_of_the_wheels_yaw_rate():
+    control = motion.from_wheels(jnp.array([0.4]), jnp.array([0.6]), 0.5, gyro=jnp.array([-0.1]))
+    np.testing.assert_allclose(control, [[0.5, -0.1]], rtol=1e-6)
+
+
+@pytest.mark.parametrize("base", [0.0, -0.3, math.nan])
+def test_a_wheel_base_that_is_no_distance_is_refused(base):
+    with pytest.raises(ValueError, match="wheel_base: expected metres > 0"):
+        motion.from_wheels(jnp.array(1.0), jnp.array(1.0), base)
+    with pytest.raises(ValueError, match="wheel_base: expected metres > 0"):
+        motion.to_wheels(jnp.array([1.0, 0.0]), base)
+
+
+def test_jacobians_keep_structure_so_that_products_with_it_vanish():
+    F, G = motion.ARC.jacobians(jnp.zeros(3), jnp.array([1.0, 0.1]), 0.1)
+    assert isinstance(F, Matrix)
+    assert (F[0, 0], F[0, 1], F[2, 2], G[2, 0]) == (1, 0, 1, 0)

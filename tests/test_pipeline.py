@@ -1,0 +1,742 @@
+"""The loop against the reference's loop, in its limiting cases, under every transformation, and with bad numbers."""
+
+import functools
+import math
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jax.sharding import Mesh, PartitionSpec
+from jax.test_util import check_grads
+
+from jaxlocmap import Config, GridSpec, Inputs, Params, ekf, grid, init, landmarks, map_scans, motion, run, step
+
+GATE = ekf.gate_threshold(0.99, 2)
+STEPS = 12  # of a short run: the course's detector looks at steps 0, 5 and 10
+
+compiled = jax.jit(run, static_argnames=("config", "collect"))
+
+
+def localise(course, config, execute=compiled):
+    """Run the filter over `course.inputs` from its prior: last state, every step's Info."""
+    state = init(course.prior, config=config)
+    mapping = {} if course.inputs.ranges is None else {"beam_angles": course.beam_angles}
+    return execute(course.params, state, course.inputs, landmarks=course.landmarks, config=config, **mapping)
+
+
+def edit(course, **fields):
+    """The course with other inputs."""
+    return course._replace(inputs=course.inputs._replace(**fields))
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def compiled_batch(params, state, inputs, landmarks, config):
+    return jax.vmap(lambda i: run(params, state, i, landmarks=landmarks, config=config))(inputs)
+
+
+def localise_batch(courses, config):
+    """Runs at once that differ in their inputs; the rest is the first one's."""
+    first = courses[0]
+    inputs = jax.tree.map(lambda *x: jnp.stack(x), *(c.inputs for c in courses))
+    return compiled_batch(first.params, init(first.prior, config=config), inputs, first.landmarks, config)
+
+
+def lane(tree, index):
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+@pytest.fixture(scope="module")
+def short(course):
+    return course.first(STEPS)
+
+
+@pytest.fixture(scope="module")
+def config(course):
+    return course.config()
+
+
+@pytest.fixture(scope="module")
+def short_result(short, config):
+    return localise(short, config)
+
+
+# --- against the independent loop
+
+
+def assert_info_is(info, expected, tolerance):
+    """Every field of Info. What divides by S is magnified by up to 1e3."""
+    got = {
+        "mean": (info.belief.mean, tolerance(1e-10, 2e-4)),
+        "cov": (info.belief.cov, tolerance(1e-12, 2e-6)),
+        "innovation": (info.innovation, tolerance(1e-10, 2e-4)),
+        "S": (info.S, tolerance(1e-12, 2e-6)),
+        "nis": (info.nis, tolerance(1e-9, 1e-2)),
+        "log_likelihood": (info.log_likelihood, tolerance(1e-9, 1e-2)),
+    }
+    for name, (value, atol) in got.items():
+        np.testing.assert_allclose(value, expected[name], rtol=0, atol=atol, err_msg=name)
+    np.testing.assert_array_equal(info.accepted, expected["accepted"])
+    assert bool(jnp.all(info.ok))
+
+
+@pytest.mark.parametrize("model", ["euler", "arc", "capstone"])
+def test_the_course_run_is_the_reference_to_every_field_and_cell(model, course, tolerance):
+    expected = reference.course_run(motion=model, conventions="design", gate=GATE)
+    state, info = localise(course, course.config(motion=model, mapping=True))
+    assert_info_is(info, expected, tolerance)
+    np.testing.assert_allclose(state.log_likelihood, expected["log_likelihood"].sum(), rtol=tolerance(1e-12, 1e-4))
+    error = np.abs(np.asarray(state.log_odds) - expected["log_odds"])
+    # Float64: another order of summation. Float32: poses are 1e-5 m off, which moves an end across the edge of a
+    # cell in one of 1e4 beams, and with it the cells along that beam.
+    assert np.mean(error > tolerance(1e-12, 1e-4)) <= tolerance(0.0, 0.01)
+
+
+def test_the_reference_is_the_courses_program():
+    """Its own conventions give the numbers of the course's text."""
+    course = reference.course_run()
+    np.testing.assert_allclose(course["mean"][-1], [6.46387367, 5.58104105, 0.32367098], atol=5e-9)
+    assert course["rmse_position"] == pytest.approx(0.0293, abs=5e-5)
+    assert course["rmse_yaw"] == pytest.approx(0.0136, abs=5e-5)
+    occupancy = [course[f"occupancy_{name}"] for name in ("min", "max", "mean")]
+    np.testing.assert_allclose(occupancy, [0.018, 0.982, 0.4352], atol=[5e-4, 5e-4, 5e-5])
+
+
+def test_the_designs_map_of_the_course_run(course):
+    state, _ = localise(course, course.config(motion="capstone", mapping=True))
+    assert float(jnp.mean(grid.probability(state.log_odds))) == pytest.approx(0.4344, abs=5e-5)
+
+
+def random_drive(seed, offset=(0.0, 0.0, 0.0)):
+    """A course with uneven steps, some of no length, empty and anonymous slots, and numbers of no sense at all."""
+    rng = np.random.default_rng(seed)
+    dt = rng.uniform(0.02, 0.3, STEPS)
+    dt[3] = 0.0
+    control = np.column_stack([rng.uniform(-1, 1, STEPS), rng.uniform(-2, 2, STEPS)])
+    landmark = rng.integers(-1, 4, (STEPS, 4)).astype(np.int32)
+    valid = rng.random((STEPS, 4)) < 0.5
+    z, pose = np.zeros((STEPS, 4, 2)), reference.COURSE_PRIOR_MEAN
+    for k in range(STEPS):
+        pose, _, _ = reference.arc(pose, control[k], dt[k])
+        for m in range(4):
+            seen = landmark[k, m] if landmark[k, m] >= 0 else rng.integers(4)
+            z[k, m] = reference.expected_observation(pose, reference.COURSE_LANDMARKS[seen], offset)[0]
+    z += rng.normal(size=z.shape) * np.where(rng.random((STEPS, 4, 1)) < 0.2, 1.0, 0.05)
+    return dt, control, landmark, z, valid
+
+
+@pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.219, -0.1, 0.7)])
+def test_uneven_steps_a_mounted_sensor_and_anonymous_outliers_are_the_reference(offset, short, tolerance):
+    drive = random_drive(0, offset)
+    expected = reference.run(
+        reference.COURSE_PRIOR_MEAN,
+        reference.COURSE_PRIOR_COV,
+        *drive,
+        reference.COURSE_LANDMARKS,
+        reference.COURSE_Q,
+        reference.COURSE_R,
+        GATE,
+        "arc",
+        0.1,
+        offset,
+    )
+    inputs = Inputs(*(jnp.array(x) for x in drive))
+    _, info = localise(short._replace(inputs=inputs), short.config(sensor_offset=offset))
+    assert_info_is(info, expected, tolerance)
+    rejected = np.asarray(inputs.valid) & ~expected["accepted"]
+    assert rejected.any()
+    assert (np.asarray(inputs.valid) & (drive[2] < 0) & expected["accepted"]).any()
+
+
+# --- limiting cases
+
+
+def test_without_observations_the_run_is_predict_alone(short, config, tolerance):
+    _, info = localise(edit(short, valid=jnp.zeros_like(short.inputs.valid)), config)
+    mean, cov = short.prior
+    predict = jax.jit(functools.partial(ekf.predict, motion=motion.ARC, nominal_dt=config.dt))
+    for k in range(STEPS):
+        mean, cov = predict(mean, cov, short.inputs.control[k], short.inputs.dt[k], short.params.Q)
+        np.testing.assert_allclose(info.belief.mean[k], mean, atol=tolerance(1e-15, 1e-6))
+        np.testing.assert_allclose(info.belief.cov[k], cov, atol=tolerance(1e-15, 1e-7))
+    for field in (info.innovation, info.S, info.nis, info.log_likelihood, info.accepted):
+        assert not jnp.any(field)
+
+
+def test_data_without_noise_leaves_no_error(short, config, tolerance):
+    pose, truth, z = reference.COURSE_PRIOR_MEAN, [], np.zeros((STEPS, 4, 2))
+    for k in range(STEPS):
+        pose, _, _ = reference.arc(pose, np.asarray(short.inputs.control[k], float), 0.1)
+        truth.append(pose)
+        z[k] = [reference.expected_observation(pose, mark)[0] for mark in reference.COURSE_LANDMARKS]
+    _, info = localise(edit(short, z=jnp.array(z), valid=jnp.ones((STEPS, 4), bool)), config)
+    np.testing.assert_allclose(info.belief.mean, truth, atol=tolerance(1e-14, 1e-5))
+    assert np.all(info.accepted)
+
+
+def test_a_wrong_prior_is_corrected(short, config):
+    """0.2 m and 0.1 rad off, with observations of 0.15 m and 0.03 rad: the course's looks bring it back."""
+    off = short.prior._replace(mean=short.prior.mean + jnp.array([0.2, -0.2, 0.1]))
+    _, lost = localise(short._replace(prior=off), config)
+    _, known = localise(short, config)
+    gap = np.abs(lost.belief.mean - known.belief.mean)
+    assert np.all(gap[-1] < 0.35 * gap.max(0) + 0.01)
+
+
+def test_500_steps_without_a_landmark_grow_the_covariance_and_stay_sound(short, config):
+    steps = 500
+    blind = Inputs(
+        dt=jnp.full(steps, 0.1),
+        control=jnp.tile(jnp.array([0.5, 0.05]), (steps, 1)),
+        landmark=jnp.zeros((steps, 1), jnp.int32),
+        z=jnp.zeros((steps, 1, 2)),
+        valid=jnp.zeros((steps, 1), bool),
+    )
+    _, info = localise(short._replace(inputs=blind), config)
+    cov = np.asarray(info.belief.cov, np.float64)
+    assert bool(jnp.all(info.ok))
+    assert np.linalg.eigvalsh(cov).min() > 0
+    assert np.all(np.diff(cov[:, 2, 2]) > 0)
+    assert np.all(np.diff(np.linalg.det(cov)) > 0)  # a prediction only adds to the volume
+
+
+def test_an_observation_outside_the_gate_is_reported_and_not_used(short, config):
+    k, slot = 0, int(np.flatnonzero(short.inputs.valid[0])[0])
+    far = edit(short, z=short.inputs.z.at[k, slot, 0].add(5.0))
+    empty = edit(short, valid=short.inputs.valid.at[k, slot].set(False))
+    (_, gated), (_, unseen) = localise(far, config), localise(empty, config)
+    assert float(gated.nis[k, slot]) > GATE
+    assert not gated.accepted[k, slot]
+    assert float(gated.innovation[k, slot, 0]) > 4.0
+    assert bool(jnp.all(gated.ok))
+    np.testing.assert_array_equal(gated.belief.mean, unseen.belief.mean)
+
+
+def test_log_likelihood_of_the_state_is_the_sum_over_observations(short_result, tolerance):
+    state, info = short_result
+    np.testing.assert_allclose(state.log_likelihood, jnp.sum(info.log_likelihood), rtol=tolerance(1e-14, 1e-5))
+
+
+# --- the same numbers however it is run
+
+
+def test_a_run_split_in_two_is_the_whole(course):
+    config = course.config(mapping=True)
+    inputs = jax.tree.map(lambda x: x[:STEPS], course.inputs)
+    whole, info = localise(course._replace(inputs=inputs), config)
+    half = STEPS // 2
+    state, infos = init(course.prior, config=config), []
+    for part in (slice(0, half), slice(half, STEPS)):
+        now = jax.tree.map(lambda x, part=part: x[part], inputs)
+        state, part_info = compiled(
+            course.params, state, now, landmarks=course.landmarks, beam_angles=course.beam_angles, config=config
+        )
+        infos.append(part_info)
+    chex.assert_trees_all_equal(state, whole)
+    chex.assert_trees_all_equal(jax.tree.map(lambda *x: jnp.concatenate(x), *infos), info)
+
+
+def test_mapping_afterwards_is_mapping_on_the_way(course):
+    on_the_way, info = localise(course, course.config(mapping=True))
+    alone, without = localise(edit(course, ranges=None), course.config())
+    chex.assert_trees_all_equal(info.belief, without.belief)
+    assert alone.log_odds is None
+    afterwards = jax.jit(map_scans, static_argnames="config")(
+        course.params,
+        jnp.zeros(course.grid.shape),
+        without.belief.mean,
+        course.inputs.ranges,
+        beam_angles=course.beam_angles,
+        config=course.config(mapping=True),
+    )
+    np.testing.assert_array_equal(afterwards, on_the_way.log_odds)
+
+
+def test_jit_is_no_jit_and_run_is_a_loop_of_steps(short, config, short_result, tolerance):
+    state = init(short.prior, config=config)
+    for k in range(2):
+        state, info = step(short.params, state, lane(short.inputs, k), landmarks=short.landmarks, config=config)
+        # The compiler may fuse a product and a sum, which is one rounding less.
+        chex.assert_trees_all_close(info, lane(short_result[1], k), rtol=tolerance(1e-12, 1e-4), atol=1e-6)
+
+
+def variants(short):
+    """Runs of different company: as the course saw, blind, and seeing anonymous landmarks at every step."""
+    blind = edit(short, valid=jnp.zeros_like(short.inputs.valid))
+    anonymous = Inputs(*(jnp.array(x) for x in random_drive(1)))
+    return short, blind, short._replace(inputs=anonymous._replace(valid=jnp.ones((STEPS, 4), bool)))
+
+
+def test_vmap_is_a_loop(short, config, tolerance):
+    runs = variants(short)
+    batch = localise_batch(runs, config)
+    for index, one in enumerate(runs):
+        chex.assert_trees_all_close(lane(batch, index), localise(one, config), rtol=tolerance(1e-11, 1e-3), atol=1e-5)
+
+
+def test_a_run_does_not_depend_on_its_company(short, config):
+    """Bit for bit, whoever else observes at a step, and whether they know what."""
+    sighted, blind, anonymous = variants(short)
+    for one in (sighted, blind, anonymous):
+        alone = lane(localise_batch([one] * 3, config), 0)
+        for others in ((blind, blind), (sighted, anonymous), (anonymous, anonymous)):
+            chex.assert_trees_all_equal(lane(localise_batch([one, *others], config), 0), alone)
+
+
+def branches(function, *args):
+    """Number of `cond`s that are still branches in the program of a function."""
+    return str(jax.make_jaxpr(function)(*args)).count("cond[")
+
+
+def test_branches_stay_branches_under_every_transformation(course, tolerance):
+    """A batched predicate would turn them into selects that run both sides; there are three, one of them the map's."""
+    config = course.config(mapping=True)
+    state, first = init(course.prior, config=config), jax.tree.map(lambda x: x[:2], course.inputs)
+
+    def likelihood(inputs):
+        return run(
+            course.params, state, inputs, landmarks=course.landmarks, beam_angles=course.beam_angles, config=config
+        )[0].log_likelihood
+
+    def slope(inputs):
+        return jax.grad(lambda z: likelihood(inputs._replace(z=z)))(inputs.z)
+
+    def batched_slope(inputs):
+        return jax.grad(lambda z: jnp.sum(jax.vmap(likelihood)(inputs._replace(z=z))))(inputs.z)
+
+    batch = jax.tree.map(lambda x: jnp.stack([x] * 2), first)
+    batches = jax.tree.map(lambda x: jnp.stack([x] * 2), batch)
+    plain, plain_slope = branches(likelihood, first), branches(slope, first)
+    assert plain >= 3
+    assert branches(jax.vmap(likelihood), batch) == plain
+    assert branches(jax.vmap(jax.vmap(likelihood)), batches) == plain
+    assert plain_slope >= 3
+    assert branches(jax.vmap(slope), batch) == plain_slope
+    assert branches(batched_slope, batch) == plain_slope
+
+
+def test_other_values_do_not_compile_again(short, config):
+    """One trace for other parameters, landmarks, inputs and prior."""
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def once(params, prior, inputs, landmarks):
+        return run(params, init(prior, config=config), inputs, landmarks=landmarks, config=config)
+
+    chex.clear_trace_counter()
+    args = (short.params, short.prior, short.inputs, short.landmarks)
+    means = [once(*args)[0].belief.mean]
+    for index in range(4):
+        other = list(args)
+        other[index] = jax.tree.map(lambda x: x * 1.01 if jnp.issubdtype(x.dtype, jnp.floating) else x, args[index])
+        means.append(once(*other)[0].belief.mean)
+    assert len({tuple(m.tolist()) for m in means}) == 5  # and every one of them mattered
+
+
+def test_a_config_made_anew_does_not_compile_again(short):
+    before = compiled._cache_size()
+    localise(short, Config(dt=0.1, motion="euler"))
+    localise(short, Config(dt=0.1, motion="euler"))
+    assert compiled._cache_size() == before + 1
+
+
+def test_shard_map_over_runs_needs_no_wrapper(short, config):
+    """With `check_vma=False`: the two sides of a branch may differ in what varies over devices."""
+    runs = variants(short)
+    inputs = jax.tree.map(lambda *x: jnp.stack(x), *(c.inputs for c in runs))
+    state = init(short.prior, config=config)
+    over_runs = PartitionSpec("runs")
+
+    def block(params, inputs, landmarks):
+        return jax.vmap(lambda i: run(params, state, i, landmarks=landmarks, config=config))(inputs)
+
+    sharded = jax.shard_map(
+        block,
+        mesh=Mesh(np.array(jax.devices()), ("runs",)),
+        in_specs=(PartitionSpec(), over_runs, PartitionSpec()),
+        out_specs=over_runs,
+        check_vma=False,
+    )
+    got = jax.jit(sharded)(short.params, inputs, short.landmarks)
+    chex.assert_trees_all_close(got, localise_batch(runs, config), rtol=1e-6, atol=1e-6)
+
+
+def test_collect_keeps_what_it_is_asked_for_with_what_lies_aside(short, config):
+    _, (info, truth) = run(
+        short.params,
+        init(short.prior, config=config),
+        short.inputs,
+        landmarks=short.landmarks,
+        config=config,
+        collect=lambda state, info, aside: (info.ok, aside * 2 + 0 * state.belief.mean[0]),
+        aside=jnp.arange(STEPS).astype(float),
+    )
+    assert info.shape == (STEPS,)
+    np.testing.assert_array_equal(truth, 2 * np.arange(STEPS))
+
+
+# --- dtypes
+
+
+def as_float32(tree):
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+
+
+def assert_float32(tree):
+    floats = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    assert floats
+    assert {x.dtype for x in floats} == {jnp.dtype(jnp.float32)}
+
+
+@pytest.fixture
+def single(course):
+    """The course's first steps in float32, whatever the session."""
+    data = as_float32((course.params, course.prior, course.inputs, course.landmarks, course.beam_angles))
+    names = ("params", "prior", "inputs", "landmarks", "beam_angles")
+    first = course._replace(**dict(zip(names, data, strict=True)))
+    return first._replace(inputs=jax.tree.map(lambda x: x[:STEPS], first.inputs))
+
+
+def test_float32_in_float32_out(single):
+    result = localise(single, single.config(mapping=True))
+    assert_float32(result)
+
+
+def test_every_atom_keeps_float32(single):
+    mean, cov = single.prior
+    z, mark, spec = single.inputs.z[0, 0], single.landmarks[0], single.grid
+    scan = (mean, single.inputs.ranges[0], single.beam_angles)
+    reach = {"spec": spec, "min_range": 0.05, "max_range": 8.0}
+    log_odds = grid.update_log_odds(
+        jnp.zeros(spec.shape, jnp.float32), *scan, single.params.l_occ, single.params.l_free, **reach
+    )
+    occupied = log_odds > 0
+    control, dt = single.inputs.control[0], single.inputs.dt[0]
+    residual, H, _ = landmarks.linearise(mean, mark, z, (0.1, 0.2, 0.3))
+    atoms = [
+        *(model.transition(mean, control, dt) for model in motion.MODELS.values()),
+        ekf.predict(mean, cov, control, dt, single.params.Q, motion=motion.ARC, nominal_dt=0.1),
+        ekf.correct(mean, cov, z, mark, single.params.R, threshold=GATE, sensor_offset=(0.1, 0.2, 0.3)),
+        [residual, H.array(jnp.float32), landmarks.observe(mean, mark, (0.1, 0.2, 0.3))],
+        motion.from_wheels(control, control, 0.4),
+        [log_odds, grid.probability(log_odds), grid.entropy_bits(log_odds)],
+        [grid.brier(log_odds, occupied, log_odds != 0), grid.calibration(log_odds, occupied, log_odds != 0)],
+        grid.endpoint_covariance(mean, cov, jnp.float32(3.0), jnp.float32(0.2), single.params.R),
+    ]
+    for atom in atoms:
+        assert_float32(atom)
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_priors_dtype_wins_over_that_of_everything_else(course, single):
+    """float32 prior, float64 the rest, and the other way round."""
+    config = course.config(mapping=True)
+    doubles = course._replace(inputs=jax.tree.map(lambda x: x[:STEPS], course.inputs))
+    assert_float32(localise(doubles._replace(prior=single.prior), config))
+    state, _ = localise(single._replace(prior=course.prior), config)
+    assert {x.dtype for x in jax.tree.leaves(state)} == {jnp.dtype(jnp.float64)}
+
+
+# --- unknown landmarks
+
+
+def test_anonymous_observations_of_the_course_run_find_their_landmark(course, config):
+    blind = edit(course, ranges=None)
+    named = localise(blind, config)
+    anonymous = localise(edit(blind, landmark=jnp.full_like(course.inputs.landmark, -1)), config)
+    chex.assert_trees_all_equal(anonymous, named)
+
+
+@pytest.mark.parametrize("beyond", [4, 1000])
+def test_a_landmark_beyond_the_table_is_flagged_and_not_used(beyond, short, config):
+    wrong = edit(short, landmark=short.inputs.landmark.at[5, 0].set(beyond), valid=short.inputs.valid.at[5, 0].set(True))
+    without = edit(short, valid=short.inputs.valid.at[5, 0].set(False))
+    (_, info), (_, expected) = localise(wrong, config), localise(without, config)
+    np.testing.assert_array_equal(info.ok, np.arange(STEPS) != 5)
+    chex.assert_trees_all_equal(info.belief, expected.belief)
+
+
+# --- bad numbers
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_control_that_is_no_number_flags_its_step_and_no_other_run(bad, place, short, config):
+    broken = edit(short, control=short.inputs.control.at[4, place].set(bad))
+    clean = localise_batch([short] * 3, config)
+    batch = localise_batch([short, broken, short], config)
+    for index in (0, 2):
+        chex.assert_trees_all_equal(lane(batch, index), lane(clean, index))
+    state, info = lane(batch, 1)
+    np.testing.assert_array_equal(info.ok, np.arange(STEPS) != 4)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state, info)))
+    # It stands still for that step and is no more certain for it.
+    np.testing.assert_array_equal(info.belief.mean[4], info.belief.mean[3])
+    assert np.linalg.eigvalsh(info.belief.cov[4] - info.belief.cov[3])[-1] > 0
+
+
+@pytest.mark.parametrize("bad", [-0.1, -1e-9, math.nan, math.inf])
+def test_a_step_length_that_is_none_is_flagged(bad, short, config):
+    _, info = localise(edit(short, dt=short.inputs.dt.at[4].set(bad)), config)
+    np.testing.assert_array_equal(info.ok, np.arange(STEPS) != 4)
+    assert np.all(np.isfinite(info.belief.cov))
+
+
+def test_a_step_of_no_length_changes_nothing(short, config):
+    _, info = localise(edit(short, dt=short.inputs.dt.at[4].set(0.0)), config)
+    assert bool(jnp.all(info.ok))
+    chex.assert_trees_all_equal(lane(info.belief, 4), lane(info.belief, 3))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("place", [0, 1])
+def test_an_observation_that_is_no_number_is_flagged_and_not_used(bad, place, short, config):
+    slot = int(np.flatnonzero(short.inputs.valid[5])[0])
+    broken = edit(short, z=short.inputs.z.at[5, slot, place].set(bad))
+    without = edit(short, valid=short.inputs.valid.at[5, slot].set(False))
+    (state, info), (expected_state, expected) = localise(broken, config), localise(without, config)
+    np.testing.assert_array_equal(info.ok, np.arange(STEPS) != 5)
+    chex.assert_trees_all_equal((state, info._replace(ok=None)), (expected_state, expected._replace(ok=None)))
+
+
+def test_an_empty_slot_may_hold_anything(short, config, short_result):
+    rubbish = edit(
+        short,
+        z=jnp.where(short.inputs.valid[..., None], short.inputs.z, jnp.nan),
+        landmark=jnp.where(short.inputs.valid, short.inputs.landmark, 99),
+    )
+    chex.assert_trees_all_equal(localise(rubbish, config), short_result)
+
+
+def test_a_covariance_that_has_broken_down_is_flagged(short, config):
+    state = init(short.prior, config=config)
+    broken = state._replace(belief=state.belief._replace(cov=-state.belief.cov))
+    _, info = compiled(short.params, broken, short.inputs, landmarks=short.landmarks, config=config)
+    assert not jnp.any(info.ok)
+
+
+def test_a_prior_that_is_no_number_is_flagged_where_it_cannot_raise(short, config):
+    bad = jnp.array([jnp.nan, 1.0, 0.0])
+    _, info = localise(short._replace(prior=short.prior._replace(mean=bad)), config)
+    assert not jnp.any(info.ok)
+
+
+# --- gradients
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("mode", ["fwd", "rev"])
+def test_gradients_through_the_run_are_finite_differences(mode, course):
+    """Two steps, with observations and scans; weights at random so that no part can cancel."""
+    config = course.config(mapping=True)
+    first = jax.tree.map(lambda x: x[:2], course.inputs)
+    rng = np.random.default_rng(0)
+    weigh_map, weigh_cov = jnp.array(rng.normal(size=course.grid.shape)), jnp.array(rng.normal(size=(3, 3)))
+
+    @jax.jit
+    def score(params, prior):
+        state, _ = run(
+            params,
+            init(prior, config=config),
+            first,
+            landmarks=course.landmarks,
+            beam_angles=course.beam_angles,
+            config=config,
+        )
+        mean, cov = state.belief
+        return state.log_likelihood + jnp.sum(weigh_map * state.log_odds) + jnp.sum(weigh_cov * cov) + 10 * jnp.sum(mean)
+
+    # Central differences of step 1e-6 relative to variances of 1e-3: 1e-3 ** 2 of their slope, here 1e-5.
+    check_grads(score, (course.params, course.prior), order=1, modes=(mode,), atol=1e-4, rtol=1e-4, eps=1e-6)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def slopes(params, prior, inputs, landmarks, config):
+    """Gradient of everything a run reports by everything it is given."""
+
+    def total(params, prior, control, z, dt, landmarks):
+        moved = inputs._replace(control=control, z=z, dt=dt)
+        state, info = run(params, init(prior, config=config), moved, landmarks=landmarks, config=config)
+        reported = (state.log_likelihood, *info.belief, info.innovation, info.S, info.nis, info.log_likelihood)
+        return sum(jnp.sum(x) for x in reported)
+
+    return jax.grad(total, argnums=range(6))(params, prior, inputs.control, inputs.z, inputs.dt, landmarks)
+
+
+NAN_CASES = {
+    "nothing observed": lambda c: edit(c, valid=jnp.zeros_like(c.inputs.valid)),
+    "NaN in empty slots": lambda c: edit(c, z=jnp.where(c.inputs.valid[..., None], c.inputs.z, jnp.nan)),
+    "NaN in a filled slot": lambda c: edit(c, z=c.inputs.z.at[5].set(jnp.nan), valid=c.inputs.valid.at[5].set(True)),
+    "NaN in a control": lambda c: edit(c, control=c.inputs.control.at[2].set(jnp.nan)),
+    "no step length": lambda c: edit(c, dt=c.inputs.dt.at[2].set(0.0)),
+    "straight ahead": lambda c: edit(c, control=c.inputs.control.at[:, 1].set(0.0)),
+    "anonymous": lambda c: edit(c, landmark=jnp.full_like(c.inputs.landmark, -1)),
+    "landmark beyond the table": lambda c: edit(c, landmark=c.inputs.landmark.at[5].set(77)),
+    "landmark on the sensor": lambda c: edit(c, control=jnp.zeros_like(c.inputs.control))._replace(
+        landmarks=c.landmarks.at[0].set(c.prior.mean[:2])
+    ),
+    "all landmarks on the sensor, anonymous": lambda c: edit(
+        c, control=jnp.zeros_like(c.inputs.control), landmark=jnp.full_like(c.inputs.landmark, -1)
+    )._replace(landmarks=jnp.tile(c.prior.mean[:2], (4, 1))),
+}
+
+
+@pytest.mark.parametrize("case", NAN_CASES)
+def test_gradients_are_numbers_when(case, short, config):
+    course = NAN_CASES[case](edit(short, valid=short.inputs.valid.at[0, 0].set(True)))
+    for gradient in jax.tree.leaves(slopes(course.params, course.prior, course.inputs, course.landmarks, config)):
+        assert np.all(np.isfinite(gradient))
+
+
+def test_gradient_of_the_map_by_the_pose_is_zero(course):
+    config = course.config(mapping=True)
+
+    def score(poses):
+        after = map_scans(
+            course.params,
+            jnp.zeros(course.grid.shape),
+            poses,
+            course.inputs.ranges[:2],
+            beam_angles=course.beam_angles,
+            config=config,
+        )
+        return jnp.sum(after**2)
+
+    poses = jnp.tile(course.prior.mean, (2, 1))
+    assert float(score(poses)) > 0
+    np.testing.assert_array_equal(jax.grad(score)(poses), np.zeros((2, 3)))
+
+
+# --- inputs that do not fit: every message names the field, what came and what was expected
+
+SCANNING = Config(grid=GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=(8, 8)))
+
+
+def refused(course, error, message, *, config=SCANNING, params=None, **fields):
+    """Assert that a run of 3 steps with other inputs is refused with that message."""
+    inputs = jax.tree.map(lambda x: x[:3], course.inputs)
+    arguments = {"landmarks": course.landmarks, "beam_angles": course.beam_angles}
+    for name in arguments.keys() & fields.keys():
+        arguments[name] = fields.pop(name)
+    state = init(course.prior, config=config)
+    with pytest.raises(error, match=message):
+        run(params or course.params, state, inputs._replace(**fields), config=config, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("dt", np.zeros(()), r"inputs\.dt: expected shape \(any\), got \(\)"),
+        ("dt", np.zeros((3, 1)), r"inputs\.dt: expected shape \(any\), got \(3, 1\)"),
+        ("dt", np.zeros(4), r"inputs\.control: expected 4 steps as inputs\.dt has, got \(3, 2\)"),
+        ("control", np.zeros((3, 3)), r"inputs\.control: expected shape \(2\), got \(3,\)"),
+        ("control", np.zeros((4, 2)), r"inputs\.control: expected 3 steps as inputs\.dt has, got \(4, 2\)"),
+        ("control", np.zeros(()), r"inputs\.control: expected 3 steps as inputs\.dt has, got \(\)"),
+        ("landmark", np.zeros((3, 5), np.int32), r"inputs\.landmark: expected shape \(4\), got \(5,\)"),
+        ("landmark", np.zeros((2, 4), np.int32), r"inputs\.landmark: expected 3 steps as inputs\.dt has, got \(2, 4\)"),
+        ("z", np.zeros((3, 4, 3)), r"inputs\.z: expected shape \(4, 2\), got \(4, 3\)"),
+        ("z", np.zeros((3, 5, 2)), r"inputs\.z: expected shape \(4, 2\), got \(5, 2\)"),
+        ("z", np.zeros((1, 4, 2)), r"inputs\.z: expected 3 steps as inputs\.dt has, got \(1, 4, 2\)"),
+        ("valid", np.zeros((3, 4, 1), bool), r"inputs\.valid: expected shape \(any\), got \(4, 1\)"),
+        ("valid", np.zeros((5, 4), bool), r"inputs\.valid: expected 3 steps as inputs\.dt has, got \(5, 4\)"),
+        ("ranges", np.zeros((3, 7)), r"inputs\.ranges: expected shape \(61\), got \(7,\)"),
+        ("ranges", np.zeros((2, 61)), r"inputs\.ranges: expected 3 steps as inputs\.dt has, got \(2, 61\)"),
+        ("landmarks", np.zeros((4, 3)), r"landmarks: expected shape \(any, 2\), got \(4, 3\)"),
+        ("landmarks", np.zeros((0, 2)), r"landmarks: expected at least one"),
+        ("landmarks", None, r"landmarks: expected \(L, 2\) for the 4 observation slots, got None"),
+        ("beam_angles", np.zeros((61, 1)), r"beam_angles: expected shape \(any\), got \(61, 1\)"),
+        ("beam_angles", None, r"beam_angles: expected \(B,\) for the ranges to map, got None"),
+    ],
+)
+def test_a_shape_that_does_not_fit_is_refused(field, value, message, course):
+    refused(course, ValueError, message, **{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("dt", np.ones(3, np.int32), r"inputs\.dt: expected dtype floating, got int32"),
+        ("control", np.ones((3, 2), np.int32), r"inputs\.control: expected dtype floating, got int32"),
+        ("landmark", np.zeros((3, 4), np.float32), r"inputs\.landmark: expected dtype integer, got float32"),
+        ("z", np.zeros((3, 4, 2), np.int32), r"inputs\.z: expected dtype floating, got int32"),
+        ("valid", np.ones((3, 4), np.int32), r"inputs\.valid: expected dtype bool_?, got int32"),
+        ("ranges", np.ones((3, 61), np.int32), r"inputs\.ranges: expected dtype floating, got int32"),
+        ("landmarks", np.ones((4, 2), np.int32), r"landmarks: expected dtype floating, got int32"),
+        ("beam_angles", np.ones(61, np.int32), r"beam_angles: expected dtype floating, got int32"),
+    ],
+)
+def test_a_dtype_of_another_kind_is_refused(field, value, message, course):
+    refused(course, TypeError, message, **{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("Q", np.diag([1.0, -1.0]), r"Q: expected a positive definite matrix, got eigenvalues \[-1\.0, 1\.0\]"),
+        ("R", np.zeros((2, 2)), r"R: expected a positive definite matrix"),
+        ("R", np.array([[1.0, 0.5], [0.2, 1.0]]), r"R: expected a symmetric matrix, got"),
+        ("Q", np.full((2, 2), np.nan), r"Q: expected finite entries, got"),
+        ("Q", np.eye(3), r"Q: expected shape \(2, 2\), got \(3, 3\)"),
+        ("l_occ", np.array(-0.1), r"l_occ: expected a finite value > 0 nats, got -0\.1"),
+        ("l_free", np.array(0.0), r"l_free: expected a finite value < 0 nats, got 0\.0"),
+        ("l_free", np.array(np.nan), r"l_free: expected a finite value < 0 nats, got nan"),
+        ("l_occ", np.ones(2), r"l_occ: expected shape \(\), got \(2,\)"),
+    ],
+)
+def test_parameters_that_cannot_be_are_refused(field, value, message, course):
+    refused(course, ValueError, message, params=course.params._replace(**{field: jnp.array(value)}))
+
+
+def test_an_unknown_motion_model_is_refused(course):
+    refused(course, ValueError, r"motion: expected one of .*'arc'.* got 'bicycle'", config=Config(motion="bicycle"))
+
+
+def test_parameters_that_are_traced_are_not_looked_at(short, config):
+    wrong = Params(*(x * 0 for x in short.params))
+    _, info = localise(short._replace(params=wrong), config)
+    assert info.ok.shape == (STEPS,)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "error", "message"),
+    [
+        ("mean", np.zeros(2), ValueError, r"prior\.mean: expected shape \(3\), got \(2,\)"),
+        ("mean", np.zeros(3, np.int32), TypeError, r"prior\.mean: expected dtype floating, got int32"),
+        ("cov", np.eye(2), ValueError, r"prior\.cov: expected shape \(3, 3\), got \(2, 2\)"),
+        ("cov", -np.eye(3), ValueError, r"prior\.cov: expected a positive semi-definite matrix, got eigenvalues"),
+        ("cov", np.full((3, 3), np.nan), ValueError, r"prior\.cov: expected finite entries, got"),
+        ("cov", np.triu(np.ones((3, 3))), ValueError, r"prior\.cov: expected a symmetric matrix, got"),
+    ],
+)
+def test_a_prior_that_cannot_be_is_refused(field, value, error, message, course):
+    with pytest.raises(error, match=message):
+        init(course.prior._replace(**{field: value}), config=Config())
+
+
+def test_a_prior_without_uncertainty_is_fine(course):
+    state = init(course.prior._replace(cov=jnp.zeros((3, 3))), config=Config())
+    assert state.log_odds is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"config": Config()}, r"config\.grid: expected a GridSpec to map into, got None"),
+        ({"log_odds": np.zeros((8, 9))}, r"log_odds: expected shape \(8, 8\), got \(8, 9\)"),
+        ({"poses": np.zeros((3, 2))}, r"poses: expected shape \(any, 3\), got \(3, 2\)"),
+        ({"ranges": np.zeros((2, 5))}, r"ranges: expected shape \(3, 5\), got \(2, 5\)"),
+        ({"beam_angles": np.zeros(6)}, r"ranges: expected shape \(3, 6\), got \(3, 5\)"),
+    ],
+)
+def test_mapping_refuses_what_does_not_fit(change, message, course):
+    arguments = {
+        "log_odds": np.zeros((8, 8)),
+        "poses": np.zeros((3, 3)),
+        "ranges": np.zeros((3, 5)),
+        "beam_angles": np.zeros(5),
+        "config": SCANNING,
+    } | change
+    with pytest.raises(ValueError, match=message):
+        map_scans(course.params, **arguments)
