@@ -123,7 +123,7 @@ def mean_over_runs(total: float, total_square: float, runs: int, expected: float
     value = total / runs
     if runs < 2:
         return Mean(value, math.nan, (-math.inf, math.inf))
-    variance = max(total_square / runs - value**2, 0.0) * runs / (runs - 1)
+    variance = max(total_square / runs - value * value, 0.0) * runs / (runs - 1)
     error = math.sqrt(variance / runs)
     reach = float(scipy.special.stdtrit(runs - 1, 0.975)) * min(error, math.sqrt(2 * expected / runs))
     return Mean(value, error, (expected - reach, expected + reach))

@@ -271,18 +271,24 @@ def _check_step(
     slots = np.shape(inputs.valid)[0]
     checks.shape("inputs.landmark", inputs.landmark, (slots,))
     checks.shape("inputs.z", inputs.z, (slots, 2))
-    checks.dtype("inputs.control", inputs.control, np.floating)
+    for name, value in (("dt", inputs.dt), ("control", inputs.control), ("z", inputs.z)):
+        checks.dtype(f"inputs.{name}", value, np.floating)
     checks.dtype("inputs.landmark", inputs.landmark, np.integer)
     checks.dtype("inputs.valid", inputs.valid, np.bool_)
     if slots:
         if landmarks is None:
             raise ValueError(f"landmarks: expected (L, 2) for the {slots} observation slots, got None")
         checks.shape("landmarks", landmarks, (None, 2))
+        checks.dtype("landmarks", landmarks, np.floating)
+        if not len(landmarks):
+            raise ValueError(f"landmarks: expected at least one for the {slots} observation slots, got (0, 2)")
     if config.grid is not None and inputs.ranges is not None:
         if beam_angles is None:
             raise ValueError("beam_angles: expected (B,) for the ranges to map, got None")
         checks.shape("beam_angles", beam_angles, (None,))
+        checks.dtype("beam_angles", beam_angles, np.floating)
         checks.shape("inputs.ranges", inputs.ranges, np.shape(beam_angles))
+        checks.dtype("inputs.ranges", inputs.ranges, np.floating)
 
 
 def _check_run(params: Params, inputs: Inputs) -> None:

@@ -121,14 +121,14 @@ def _totals(steps: _Scored, valid: jax.Array, map_totals: MapTotals | None) -> T
     dtype = steps.nees.dtype
     scored = jnp.isfinite(steps.nees) & (steps.nees >= 0)  # below zero the covariance is none
     nees = jnp.where(scored, steps.nees, 0)
-    run_nees = jnp.sum(nees) / jnp.maximum(jnp.sum(scored), 1)
-    observed = jnp.sum(steps.measured)
+    run_nees = jnp.sum(nees) / jnp.maximum(jnp.sum(scored, dtype=dtype), 1)
+    observed = jnp.sum(steps.measured, dtype=dtype)
     run_nis = jnp.sum(steps.nis) / jnp.maximum(observed, 1)
     quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
     products, squares, pairs = consistency.lag_one(steps.white, steps.measured)
     last = steps.error[-1]
-    # A comparison with NaN is False, so a run that ended without a number counts as lost.
-    kept = last[0] ** 2 + last[1] ** 2 <= _DIVERGED**2
+    # A comparison with NaN is False, so a run that ended without a number, or without a covariance, counts as lost.
+    kept = (last[0] ** 2 + last[1] ** 2 <= _DIVERGED**2) & jnp.all(jnp.isfinite(steps.variance[-1]))
     return Totals(
         runs=jnp.ones((), dtype),
         scored_runs=jnp.any(scored).astype(dtype),

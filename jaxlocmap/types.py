@@ -90,7 +90,11 @@ class Params(NamedTuple):
             got = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
             raise ValueError(f"{path}: expected exactly the fields {cls._fields}, got {got}")
         try:
-            params = cls(**{name: jnp.asarray(np.asarray(value, float)) for name, value in fields.items()})
+            values = {name: np.asarray(value) for name, value in fields.items()}
+            for name, value in values.items():
+                if value.dtype.kind not in "if":
+                    raise ValueError(f"{name}: expected numbers, got {fields[name]!r}")
+            params = cls(**{name: jnp.asarray(value.astype(float)) for name, value in values.items()})
             params.check()
         except (TypeError, ValueError) as error:
             raise ValueError(f"{path}: {error}") from None

@@ -51,9 +51,12 @@ class Course(NamedTuple):
     def config(self, *, motion="arc", mapping=False, **kwargs):
         return Config(dt=reference.COURSE_DT, motion=motion, grid=self.grid if mapping else None, **kwargs)
 
-    def first(self, steps):
-        """The same with the first steps only, and without scans."""
-        return self._replace(inputs=jax.tree.map(lambda x: x[:steps], self.inputs._replace(ranges=None)))
+    def first(self, steps, *, slots=2, scans=False):
+        """The first steps only, and the last slots: near the start the robot sees the last landmark alone."""
+        dt, control, landmark, z, valid, ranges = jax.tree.map(lambda x: x[:steps], self.inputs)
+        some = slice(-slots, None)
+        cut = Inputs(dt, control, landmark[:, some], z[:, some], valid[:, some], ranges if scans else None)
+        return self._replace(inputs=cut)
 
 
 @pytest.fixture(scope="session")

@@ -51,9 +51,7 @@ def added(dt, steps, omega):
     mean, cov = jnp.array(MEAN), jnp.zeros((3, 3))
     for _ in range(steps):
         control = jnp.array([0.6, omega])
-        mean, cov = ekf.predict(
-            mean, cov, control, jnp.array(dt), jnp.array(Q), motion=motion.EULER, nominal_dt=0.1
-        )
+        mean, cov = ekf.predict(mean, cov, control, jnp.array(dt), jnp.array(Q), motion=motion.EULER, nominal_dt=0.1)
     return np.asarray(cov)
 
 

@@ -110,10 +110,10 @@ def test_wrap_lands_in_the_circle_on_the_same_angle(angle):
     assert abs(turns - round(turns)) * 2 * math.pi <= ulps(32)
 
 
-@given(angle=st.floats(-EDGE, EDGE, allow_subnormal=False))
+@given(angle=st.floats(-EDGE, EDGE))
 def test_wrap_leaves_an_angle_inside_as_it_is(angle):
     angle = jnp.array(angle)
-    if float(angle) < EDGE - ulps(2):
+    if 1e-37 < abs(float(angle)) < EDGE - ulps(2):  # XLA flushes subnormal numbers to zero
         assert float(motion.wrap(angle)) == float(angle)
 
 

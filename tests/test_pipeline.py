@@ -16,6 +16,7 @@ from jaxlocmap import Config, GridSpec, Inputs, Params, ekf, grid, init, landmar
 
 GATE = ekf.gate_threshold(0.99, 2)
 STEPS = 12  # of a short run: the course's detector looks at steps 0, 5 and 10
+SLOTS = 2
 
 compiled = jax.jit(run, static_argnames=("config", "collect"))
 
@@ -101,7 +102,7 @@ def test_the_reference_is_the_courses_program():
     assert course["rmse_position"] == pytest.approx(0.0293, abs=5e-5)
     assert course["rmse_yaw"] == pytest.approx(0.0136, abs=5e-5)
     occupancy = [course[f"occupancy_{name}"] for name in ("min", "max", "mean")]
-    np.testing.assert_allclose(occupancy, [0.018, 0.982, 0.4352], atol=[5e-4, 5e-4, 5e-5])
+    assert np.all(np.abs(np.subtract(occupancy, [0.018, 0.982, 0.4352])) < [5e-4, 5e-4, 5e-5])
 
 
 def test_the_designs_map_of_the_course_run(course):
@@ -115,15 +116,15 @@ def random_drive(seed, offset=(0.0, 0.0, 0.0)):
     dt = rng.uniform(0.02, 0.3, STEPS)
     dt[3] = 0.0
     control = np.column_stack([rng.uniform(-1, 1, STEPS), rng.uniform(-2, 2, STEPS)])
-    landmark = rng.integers(-1, 4, (STEPS, 4)).astype(np.int32)
-    valid = rng.random((STEPS, 4)) < 0.5
-    z, pose = np.zeros((STEPS, 4, 2)), reference.COURSE_PRIOR_MEAN
+    landmark = np.where(rng.random((STEPS, SLOTS)) < 0.4, -1, rng.integers(4, size=(STEPS, SLOTS))).astype(np.int32)
+    valid = rng.random((STEPS, SLOTS)) < 0.7
+    z, pose = np.zeros((STEPS, SLOTS, 2)), reference.COURSE_PRIOR_MEAN
     for k in range(STEPS):
         pose, _, _ = reference.arc(pose, control[k], dt[k])
-        for m in range(4):
+        for m in range(SLOTS):
             seen = landmark[k, m] if landmark[k, m] >= 0 else rng.integers(4)
             z[k, m] = reference.expected_observation(pose, reference.COURSE_LANDMARKS[seen], offset)[0]
-    z += rng.normal(size=z.shape) * np.where(rng.random((STEPS, 4, 1)) < 0.2, 1.0, 0.05)
+    z += rng.normal(size=z.shape) * np.where(rng.random((STEPS, SLOTS, 1)) < 0.3, 3.0, 0.05)
     return dt, control, landmark, z, valid
 
 
@@ -166,23 +167,14 @@ def test_without_observations_the_run_is_predict_alone(short, config, tolerance)
 
 
 def test_data_without_noise_leaves_no_error(short, config, tolerance):
-    pose, truth, z = reference.COURSE_PRIOR_MEAN, [], np.zeros((STEPS, 4, 2))
+    pose, truth, z = reference.COURSE_PRIOR_MEAN, [], np.zeros((STEPS, SLOTS, 2))
     for k in range(STEPS):
         pose, _, _ = reference.arc(pose, np.asarray(short.inputs.control[k], float), 0.1)
         truth.append(pose)
-        z[k] = [reference.expected_observation(pose, mark)[0] for mark in reference.COURSE_LANDMARKS]
-    _, info = localise(edit(short, z=jnp.array(z), valid=jnp.ones((STEPS, 4), bool)), config)
+        z[k] = [reference.expected_observation(pose, mark)[0] for mark in reference.COURSE_LANDMARKS[-SLOTS:]]
+    _, info = localise(edit(short, z=jnp.array(z), valid=jnp.ones((STEPS, SLOTS), bool)), config)
     np.testing.assert_allclose(info.belief.mean, truth, atol=tolerance(1e-14, 1e-5))
     assert np.all(info.accepted)
-
-
-def test_a_wrong_prior_is_corrected(short, config):
-    """0.2 m and 0.1 rad off, with observations of 0.15 m and 0.03 rad: the course's looks bring it back."""
-    off = short.prior._replace(mean=short.prior.mean + jnp.array([0.2, -0.2, 0.1]))
-    _, lost = localise(short._replace(prior=off), config)
-    _, known = localise(short, config)
-    gap = np.abs(lost.belief.mean - known.belief.mean)
-    assert np.all(gap[-1] < 0.35 * gap.max(0) + 0.01)
 
 
 def test_500_steps_without_a_landmark_grow_the_covariance_and_stay_sound(short, config):
@@ -224,12 +216,12 @@ def test_log_likelihood_of_the_state_is_the_sum_over_observations(short_result, 
 
 def test_a_run_split_in_two_is_the_whole(course):
     config = course.config(mapping=True)
-    inputs = jax.tree.map(lambda x: x[:STEPS], course.inputs)
-    whole, info = localise(course._replace(inputs=inputs), config)
+    first = course.first(STEPS, scans=True)
+    whole, info = localise(first, config)
     half = STEPS // 2
     state, infos = init(course.prior, config=config), []
     for part in (slice(0, half), slice(half, STEPS)):
-        now = jax.tree.map(lambda x, part=part: x[part], inputs)
+        now = lane(first.inputs, part)
         state, part_info = compiled(
             course.params, state, now, landmarks=course.landmarks, beam_angles=course.beam_angles, config=config
         )
@@ -254,34 +246,48 @@ def test_mapping_afterwards_is_mapping_on_the_way(course):
     np.testing.assert_array_equal(afterwards, on_the_way.log_odds)
 
 
-def test_jit_is_no_jit_and_run_is_a_loop_of_steps(short, config, short_result, tolerance):
-    state = init(short.prior, config=config)
-    for k in range(2):
-        state, info = step(short.params, state, lane(short.inputs, k), landmarks=short.landmarks, config=config)
-        # The compiler may fuse a product and a sum, which is one rounding less.
-        chex.assert_trees_all_close(info, lane(short_result[1], k), rtol=tolerance(1e-12, 1e-4), atol=1e-6)
+def test_a_run_is_a_loop_of_steps(short, config, short_result, tolerance):
+    state, compiled_step = init(short.prior, config=config), jax.jit(step, static_argnames="config")
+    for k in range(STEPS):
+        state, info = compiled_step(
+            short.params, state, lane(short.inputs, k), landmarks=short.landmarks, config=config
+        )
+        # The compiler may leave out roundings in one program and not in the other.
+        chex.assert_trees_all_close(
+            info, lane(short_result[1], k), rtol=tolerance(1e-11, 1e-3), atol=tolerance(1e-13, 1e-5)
+        )
+
+
+def test_jit_is_no_jit(short, config, short_result, tolerance):
+    got = localise(short, config, execute=run)
+    chex.assert_trees_all_close(got, short_result, rtol=tolerance(1e-11, 1e-3), atol=tolerance(1e-13, 1e-5))
 
 
 def variants(short):
-    """Runs of different company: as the course saw, blind, and seeing anonymous landmarks at every step."""
+    """Different runs: as the course saw, blind, anonymous landmarks at every step, and the same with wrong names."""
     blind = edit(short, valid=jnp.zeros_like(short.inputs.valid))
-    anonymous = Inputs(*(jnp.array(x) for x in random_drive(1)))
-    return short, blind, short._replace(inputs=anonymous._replace(valid=jnp.ones((STEPS, 4), bool)))
+    drive = Inputs(*(jnp.array(x) for x in random_drive(1)))._replace(valid=jnp.ones((STEPS, SLOTS), bool))
+    anonymous = short._replace(inputs=drive._replace(landmark=jnp.full_like(drive.landmark, -1)))
+    return short, blind, anonymous, edit(anonymous, landmark=jnp.zeros_like(drive.landmark))
 
 
 def test_vmap_is_a_loop(short, config, tolerance):
     runs = variants(short)
     batch = localise_batch(runs, config)
     for index, one in enumerate(runs):
-        chex.assert_trees_all_close(lane(batch, index), localise(one, config), rtol=tolerance(1e-11, 1e-3), atol=1e-5)
+        chex.assert_trees_all_close(
+            lane(batch, index), localise(one, config), rtol=tolerance(1e-11, 1e-3), atol=tolerance(1e-13, 1e-5)
+        )
 
 
-def test_a_run_does_not_depend_on_its_company(short, config):
-    """Bit for bit, whoever else observes at a step, and whether they know what."""
-    sighted, blind, anonymous = variants(short)
-    for one in (sighted, blind, anonymous):
+@pytest.mark.parametrize("gate", [0.99, None])
+def test_a_run_does_not_depend_on_its_company(gate, short):
+    """Bit for bit, whoever else observes at a step, and whether they know what; also where no gate would help."""
+    config = short.config(gate_probability=gate)
+    sighted, blind, anonymous, misnamed = variants(short)
+    for one in (sighted, blind, anonymous, misnamed):
         alone = lane(localise_batch([one] * 3, config), 0)
-        for others in ((blind, blind), (sighted, anonymous), (anonymous, anonymous)):
+        for others in ((blind, blind), (sighted, anonymous), (anonymous, misnamed)):
             chex.assert_trees_all_equal(lane(localise_batch([one, *others], config), 0), alone)
 
 
@@ -290,10 +296,10 @@ def branches(function, *args):
     return str(jax.make_jaxpr(function)(*args)).count("cond[")
 
 
-def test_branches_stay_branches_under_every_transformation(course, tolerance):
+def test_branches_stay_branches_under_every_transformation(course):
     """A batched predicate would turn them into selects that run both sides; there are three, one of them the map's."""
     config = course.config(mapping=True)
-    state, first = init(course.prior, config=config), jax.tree.map(lambda x: x[:2], course.inputs)
+    state, first = init(course.prior, config=config), course.first(2, slots=1, scans=True).inputs
 
     def likelihood(inputs):
         return run(
@@ -393,10 +399,9 @@ def assert_float32(tree):
 @pytest.fixture
 def single(course):
     """The course's first steps in float32, whatever the session."""
-    data = as_float32((course.params, course.prior, course.inputs, course.landmarks, course.beam_angles))
+    first = course.first(STEPS, scans=True)
     names = ("params", "prior", "inputs", "landmarks", "beam_angles")
-    first = course._replace(**dict(zip(names, data, strict=True)))
-    return first._replace(inputs=jax.tree.map(lambda x: x[:STEPS], first.inputs))
+    return first._replace(**{name: as_float32(getattr(first, name)) for name in names})
 
 
 def test_float32_in_float32_out(single):
@@ -405,27 +410,32 @@ def test_float32_in_float32_out(single):
 
 
 def test_every_atom_keeps_float32(single):
-    mean, cov = single.prior
-    z, mark, spec = single.inputs.z[0, 0], single.landmarks[0], single.grid
-    scan = (mean, single.inputs.ranges[0], single.beam_angles)
-    reach = {"spec": spec, "min_range": 0.05, "max_range": 8.0}
-    log_odds = grid.update_log_odds(
-        jnp.zeros(spec.shape, jnp.float32), *scan, single.params.l_occ, single.params.l_free, **reach
-    )
-    occupied = log_odds > 0
-    control, dt = single.inputs.control[0], single.inputs.dt[0]
-    residual, H, _ = landmarks.linearise(mean, mark, z, (0.1, 0.2, 0.3))
-    atoms = [
-        *(model.transition(mean, control, dt) for model in motion.MODELS.values()),
-        ekf.predict(mean, cov, control, dt, single.params.Q, motion=motion.ARC, nominal_dt=0.1),
-        ekf.correct(mean, cov, z, mark, single.params.R, threshold=GATE, sensor_offset=(0.1, 0.2, 0.3)),
-        [residual, H.array(jnp.float32), landmarks.observe(mean, mark, (0.1, 0.2, 0.3))],
-        motion.from_wheels(control, control, 0.4),
-        [log_odds, grid.probability(log_odds), grid.entropy_bits(log_odds)],
-        [grid.brier(log_odds, occupied, log_odds != 0), grid.calibration(log_odds, occupied, log_odds != 0)],
-        grid.endpoint_covariance(mean, cov, jnp.float32(3.0), jnp.float32(0.2), single.params.R),
-    ]
-    for atom in atoms:
+    spec, reach = single.grid, {"min_range": 0.05, "max_range": 8.0}
+    offset = (0.1, 0.2, 0.3)
+
+    @jax.jit
+    def every_atom(params, prior, inputs, mark, beam_angles):
+        (mean, cov), z, control, dt = prior, inputs.z[0], inputs.control, inputs.dt
+        residual, H, _ = landmarks.linearise(mean, mark, z, offset)
+        empty = jnp.zeros(spec.shape, jnp.float32)
+        log_odds = grid.update_log_odds(
+            empty, mean, inputs.ranges, beam_angles, params.l_occ, params.l_free, spec=spec, **reach
+        )
+        occupied = log_odds > 0
+        return {
+            "transition": [model.transition(mean, control, dt) for model in motion.MODELS.values()],
+            "predict": ekf.predict(mean, cov, control, dt, params.Q, motion=motion.ARC, nominal_dt=0.1),
+            "correct": ekf.correct(mean, cov, z, mark, params.R, threshold=GATE, sensor_offset=offset),
+            "sensor": [residual, H.array(jnp.float32), landmarks.observe(mean, mark, offset)],
+            "wheels": [motion.from_wheels(dt, z[0], 0.4), motion.to_wheels(control, 0.4)],
+            "map": [log_odds, grid.probability(log_odds), grid.entropy_bits(log_odds)],
+            "brier": grid.brier(log_odds, occupied, occupied),
+            "calibration": grid.calibration(log_odds, occupied, occupied),
+            "end": grid.endpoint_covariance(mean, cov, z[0], z[1], params.R),
+        }
+
+    now = lane(single.inputs, 0)
+    for atom in every_atom(single.params, single.prior, now, single.landmarks[0], single.beam_angles).values():
         assert_float32(atom)
 
 
@@ -433,7 +443,7 @@ def test_every_atom_keeps_float32(single):
 def test_the_priors_dtype_wins_over_that_of_everything_else(course, single):
     """float32 prior, float64 the rest, and the other way round."""
     config = course.config(mapping=True)
-    doubles = course._replace(inputs=jax.tree.map(lambda x: x[:STEPS], course.inputs))
+    doubles = course.first(STEPS, scans=True)
     assert_float32(localise(doubles._replace(prior=single.prior), config))
     state, _ = localise(single._replace(prior=course.prior), config)
     assert {x.dtype for x in jax.tree.leaves(state)} == {jnp.dtype(jnp.float64)}
@@ -451,7 +461,9 @@ def test_anonymous_observations_of_the_course_run_find_their_landmark(course, co
 
 @pytest.mark.parametrize("beyond", [4, 1000])
 def test_a_landmark_beyond_the_table_is_flagged_and_not_used(beyond, short, config):
-    wrong = edit(short, landmark=short.inputs.landmark.at[5, 0].set(beyond), valid=short.inputs.valid.at[5, 0].set(True))
+    wrong = edit(
+        short, landmark=short.inputs.landmark.at[5, 0].set(beyond), valid=short.inputs.valid.at[5, 0].set(True)
+    )
     without = edit(short, valid=short.inputs.valid.at[5, 0].set(False))
     (_, info), (_, expected) = localise(wrong, config), localise(without, config)
     np.testing.assert_array_equal(info.ok, np.arange(STEPS) != 5)
@@ -527,29 +539,25 @@ def test_a_prior_that_is_no_number_is_flagged_where_it_cannot_raise(short, confi
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize("mode", ["fwd", "rev"])
-def test_gradients_through_the_run_are_finite_differences(mode, course):
-    """Two steps, with observations and scans; weights at random so that no part can cancel."""
-    config = course.config(mapping=True)
-    first = jax.tree.map(lambda x: x[:2], course.inputs)
+def test_gradients_through_the_run_are_finite_differences(course):
+    """Two steps, with an observation and scans; weights at random so that no part can cancel."""
+    config = Config(grid=GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(12, 12), l_min=-50.0, l_max=50.0))
+    first = course.first(2, slots=1, scans=True).inputs
+    first = first._replace(ranges=first.ranges[:, ::15])
     rng = np.random.default_rng(0)
-    weigh_map, weigh_cov = jnp.array(rng.normal(size=course.grid.shape)), jnp.array(rng.normal(size=(3, 3)))
+    weigh_map, weigh_cov = jnp.array(rng.normal(size=config.grid.shape)), jnp.array(rng.normal(size=(3, 3)))
 
     @jax.jit
     def score(params, prior):
-        state, _ = run(
-            params,
-            init(prior, config=config),
-            first,
-            landmarks=course.landmarks,
-            beam_angles=course.beam_angles,
-            config=config,
-        )
+        given = {"landmarks": course.landmarks, "beam_angles": course.beam_angles[::15]}
+        state, _ = run(params, init(prior, config=config), first, config=config, **given)
         mean, cov = state.belief
-        return state.log_likelihood + jnp.sum(weigh_map * state.log_odds) + jnp.sum(weigh_cov * cov) + 10 * jnp.sum(mean)
+        return (
+            state.log_likelihood + jnp.sum(weigh_map * state.log_odds) + jnp.sum(weigh_cov * cov) + 10 * jnp.sum(mean)
+        )
 
-    # Central differences of step 1e-6 relative to variances of 1e-3: 1e-3 ** 2 of their slope, here 1e-5.
-    check_grads(score, (course.params, course.prior), order=1, modes=(mode,), atol=1e-4, rtol=1e-4, eps=1e-6)
+    # Differences of step 3e-7 on variances of 4e-4: the cubic term is 1e-6 of the slope, rounding 1e-14 / 3e-7.
+    check_grads(score, (course.params, course.prior), order=1, modes=("fwd", "rev"), atol=1e-5, rtol=1e-5, eps=3e-7)
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -575,7 +583,7 @@ NAN_CASES = {
     "anonymous": lambda c: edit(c, landmark=jnp.full_like(c.inputs.landmark, -1)),
     "landmark beyond the table": lambda c: edit(c, landmark=c.inputs.landmark.at[5].set(77)),
     "landmark on the sensor": lambda c: edit(c, control=jnp.zeros_like(c.inputs.control))._replace(
-        landmarks=c.landmarks.at[0].set(c.prior.mean[:2])
+        landmarks=c.landmarks.at[2].set(c.prior.mean[:2])
     ),
     "all landmarks on the sensor, anonymous": lambda c: edit(
         c, control=jnp.zeros_like(c.inputs.control), landmark=jnp.full_like(c.inputs.landmark, -1)
@@ -584,7 +592,8 @@ NAN_CASES = {
 
 
 @pytest.mark.parametrize("case", NAN_CASES)
-def test_gradients_are_numbers_when(case, short, config):
+def test_gradients_are_numbers_when(case, course, config):
+    short = course.first(6)
     course = NAN_CASES[case](edit(short, valid=short.inputs.valid.at[0, 0].set(True)))
     for gradient in jax.tree.leaves(slopes(course.params, course.prior, course.inputs, course.landmarks, config)):
         assert np.all(np.isfinite(gradient))
@@ -723,7 +732,7 @@ def test_a_prior_without_uncertainty_is_fine(course):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"config": Config()}, r"config\.grid: expected a GridSpec to map into, got None"),
+        ({"config": Config()}, r"config\.grid: expected .*GridSpec.*, got None"),
         ({"log_odds": np.zeros((8, 9))}, r"log_odds: expected shape \(8, 8\), got \(8, 9\)"),
         ({"poses": np.zeros((3, 2))}, r"poses: expected shape \(any, 3\), got \(3, 2\)"),
         ({"ranges": np.zeros((2, 5))}, r"ranges: expected shape \(3, 5\), got \(2, 5\)"),

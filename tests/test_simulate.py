@@ -21,9 +21,7 @@ occupancy = jax.jit(simulate.occupancy, static_argnums=1)
 draw_poses = jax.jit(jax.vmap(simulate.draw_pose, in_axes=(0, None)))
 
 
-@functools.partial(jax.jit, static_argnames=("scenario", "scan"))
-def simulated(key, world, noise, start, *, scenario, scan=True):
-    return simulate.simulate(key, world, noise, start, scenario=scenario, scan=scan)
+simulated = jax.jit(simulate.simulate, static_argnames=("scenario", "scan"))
 
 
 @functools.partial(jax.jit, static_argnames=("scenario", "scan"))
@@ -32,15 +30,15 @@ def simulated_by_key_and_start(keys, world, noise, starts, *, scenario, scan):
     return jax.vmap(one, in_axes=(0, None, None, 0))(keys, world, noise, starts)
 
 
-def many(seed, count, scenario, noise=None, *, start=None, scan=False):
-    """Drives of `count` keys, from starts drawn from the prior unless given."""
+def many(seed, count, scenario, *, start=None, scan=False):
+    """Drives of `count` keys as NumPy arrays, from starts drawn from the prior unless given."""
     keys = jax.random.split(jax.random.key(seed), count)
     if start is None:
         starts = draw_poses(jax.random.split(keys[0], count), scenario.prior())
     else:
         starts = jnp.broadcast_to(jnp.array(start), (count, 3))
-    noise = Noise() if noise is None else noise
-    return simulated_by_key_and_start(keys, simulate.room(), noise, starts, scenario=scenario, scan=scan)
+    drives = simulated_by_key_and_start(keys, simulate.room(), Noise(), starts, scenario=scenario, scan=scan)
+    return jax.tree.map(np.asarray, drives)
 
 
 @pytest.fixture(scope="module")
@@ -150,50 +148,31 @@ def test_the_same_key_gives_the_same_numbers_and_another_key_others():
     assert not np.any(first[1].ranges == other[1].ranges)
 
 
-def test_batched_over_keys_is_a_python_loop(tolerance):
-    keys = jax.random.split(jax.random.key(0), 3)
-    starts = jnp.tile(jnp.array(SHORT.start), (3, 1))
-    batch = simulated_by_key_and_start(keys, simulate.room(), Noise(), starts, scenario=SHORT, scan=True)
-    for i, key in enumerate(keys):
-        alone = simulated(key, simulate.room(), Noise(), starts[i], scenario=SHORT)
-        jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=tolerance(1e-12, 1e-5)),
-            alone,
-            jax.tree.map(lambda x, i=i: x[i], batch),
-        )
-
-
-def test_compiled_or_not_a_drive_is_the_same(tolerance):
-    args = (jax.random.key(0), simulate.room(), Noise(), jnp.array(SHORT.start))
-    plain = simulate.simulate(*args, scenario=SHORT)
-    compiled = simulated(*args, scenario=SHORT)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=tolerance(1e-12, 1e-5)), plain, compiled)
-
-
-def test_a_drive_without_scans_is_the_same_drive():
-    args = (jax.random.key(0), simulate.room(), Noise(), jnp.array(SHORT.start))
-    (truth, inputs), (other_truth, other) = (simulated(*args, scenario=SHORT, scan=scan) for scan in (True, False))
-    assert other.ranges is None
-    np.testing.assert_allclose(truth.pose, other_truth.pose, rtol=1e-6)
-    np.testing.assert_allclose(inputs.z, other.z, rtol=1e-5)
-
-
-def test_worlds_and_noises_may_differ_from_run_to_run():
-    room = simulate.room()
-    worlds = jax.tree.map(lambda x: jnp.stack([x, x * 1.5]), room)
-    noises = jax.tree.map(lambda s: jnp.array([1.0, 2.0]) * s, Noise())
-    key, start = jax.random.key(0), jnp.array(SHORT.start)
-    one = jax.vmap(lambda world, noise: simulate.simulate(key, world, noise, start, scenario=SHORT))
-    batch = jax.jit(one)(worlds, noises)
+def test_a_batch_of_keys_worlds_noises_and_starts_is_a_python_loop(tolerance):
+    batch = (
+        jax.random.split(jax.random.key(0), 2),
+        jax.tree.map(lambda x: jnp.stack([x, x * 1.5]), simulate.room()),
+        jax.tree.map(lambda std: jnp.array([1.0, 2.0]) * std, Noise()),
+        jnp.array([SHORT.start, (2.0, 3.0, 1.0)]),
+    )
+    both = jax.jit(jax.vmap(functools.partial(simulate.simulate, scenario=SHORT)))(*batch)
     for i in range(2):
-        world, noise = jax.tree.map(lambda x, i=i: x[i], (worlds, noises))
-        alone = simulated(key, world, noise, start, scenario=SHORT)
+        alone = simulated(*jax.tree.map(lambda x, i=i: x[i], batch), scenario=SHORT)
         jax.tree.map(
-            lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-5),
-            alone,
-            jax.tree.map(lambda x, i=i: x[i], batch),
+            lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=0, atol=tolerance(1e-12, 1e-5)), alone, both
         )
-    assert np.max(np.abs(batch[1].ranges[0] - batch[1].ranges[1])) > 0.5  # a larger room, longer beams
+
+
+def test_neither_compiling_nor_leaving_out_the_scanner_changes_the_drive(tolerance):
+    args = (jax.random.key(0), simulate.room(), Noise(), jnp.array(SHORT.start))
+    truth, inputs = simulated(*args, scenario=SHORT)
+    plain_truth, plain_inputs = simulate.simulate(*args, scenario=SHORT, scan=False)
+    assert plain_inputs.ranges is None
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=tolerance(1e-12, 1e-5)),
+        (truth, inputs._replace(ranges=None)),
+        (plain_truth, plain_inputs),
+    )
 
 
 def test_the_true_start_has_the_prior_s_mean_and_covariance():

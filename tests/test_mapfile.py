@@ -1,0 +1,209 @@
+"""Maps as files: what is written comes back cell for cell, and a damaged file is named."""
+
+import math
+
+import numpy as np
+import pytest
+
+from jaxlocmap import GridSpec
+from jaxlocmap.mapfile import FREE, OCCUPIED, UNKNOWN, load_map, save_map, trinary
+
+SHEET = "image: map.pgm\nresolution: 0.5\norigin: [1, 2, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+GREYS = bytes([0, 254, 205, 100, 205, 205])  # 3 columns, 2 rows, the upper row first
+
+
+def written(folder, sheet=SHEET, picture=b"P5\n3 2\n255\n" + GREYS):
+    (folder / "map.yaml").write_text(sheet)
+    (folder / "map.pgm").write_bytes(picture)
+    return folder / "map.yaml"
+
+
+def nats(probability):
+    return math.log(probability / (1 - probability))
+
+
+# --- What is written ---
+
+
+@pytest.mark.parametrize(
+    ("origin", "resolution", "shape"),
+    [
+        ((0.0, 0.0), 0.2, (4, 7)),
+        ((-12.345678901234567, 1e-5), 0.05, (9, 2)),
+        ((1e4, -3.5), 1 / 3, (1, 1)),
+        (np.array([-0.1, 0.7]), np.float64(0.1), (5, 3)),
+    ],
+)
+def test_a_map_comes_back_cell_for_cell(tmp_path, origin, resolution, shape):
+    log_odds = np.random.default_rng(0).normal(0, 2, shape)
+    cells = save_map(tmp_path, log_odds, GridSpec(origin, resolution, shape), name="kitchen")
+    loaded = load_map(tmp_path / "kitchen.yaml")
+    np.testing.assert_array_equal(loaded.cells, cells)
+    np.testing.assert_array_equal(cells, trinary(log_odds))
+    assert loaded.spec == GridSpec(tuple(map(float, origin)), float(resolution), shape)
+    assert cells.dtype == loaded.cells.dtype == np.int8
+
+
+@pytest.mark.parametrize(("occupied_above", "free_below"), [(0.9, 0.3), (0.15, 0.1), (0.5, 0.003)])
+def test_a_map_sorted_by_other_thresholds_comes_back_as_it_was_sorted(tmp_path, occupied_above, free_below):
+    # The picture has one grey for unknown: a sheet with these thresholds would call it free, or occupied.
+    log_odds = np.linspace(-7, 7, 60).reshape(6, 10)
+    spec = GridSpec((0.0, 0.0), 0.1, (6, 10))
+    cells = save_map(tmp_path, log_odds, spec, occupied_above=occupied_above, free_below=free_below)
+    assert {OCCUPIED, FREE, UNKNOWN} == set(np.unique(cells))
+    np.testing.assert_array_equal(load_map(tmp_path / "map.yaml").cells, cells)
+
+
+def test_the_cell_at_the_top_left_is_the_first_pixel(tmp_path):
+    log_odds = np.zeros((3, 4))
+    log_odds[2, 0] = 4  # the highest y, the lowest x
+    log_odds[0, 3] = -4  # the lowest y, the highest x
+    save_map(tmp_path, log_odds, GridSpec((0.0, 0.0), 1.0, (3, 4)))
+    picture = (tmp_path / "map.pgm").read_bytes()
+    assert picture == b"P5\n4 3\n255\n" + bytes([0, *[205] * 10, 254])
+
+
+def test_the_sheet_is_what_map_server_reads(tmp_path):
+    save_map(tmp_path, np.zeros((2, 2)), GridSpec((-1.5, 2.0), 0.05, (2, 2)))
+    assert (tmp_path / "map.yaml").read_text() == (
+        "image: map.pgm\nmode: trinary\nresolution: 0.05\norigin: [-1.5, 2.0, 0.0]\nnegate: 0\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+
+
+def test_cells_are_sorted_by_probability_the_thresholds_themselves_being_unknown():
+    at = np.array([[0.64, 0.66, 0.5], [0.197, 0.195, 0.0001]])
+    np.testing.assert_array_equal(
+        trinary(np.vectorize(nats)(at)), [[UNKNOWN, OCCUPIED, UNKNOWN], [UNKNOWN, FREE, FREE]]
+    )
+    edges = np.array([[nats(0.65), nats(0.196), math.nan, math.inf, -math.inf]])
+    np.testing.assert_array_equal(trinary(edges), [[UNKNOWN, UNKNOWN, UNKNOWN, OCCUPIED, FREE]])
+    np.testing.assert_array_equal(trinary(np.zeros((1, 1)), occupied_above=0.4, free_below=0.3), [[OCCUPIED]])
+
+
+@pytest.mark.parametrize(("occupied_above", "free_below"), [(0.2, 0.3), (0.5, 0.5), (1.0, 0.2), (0.6, 0.0)])
+def test_thresholds_out_of_order_are_refused(tmp_path, occupied_above, free_below):
+    with pytest.raises(ValueError, match="thresholds: expected 0 < free_below < occupied_above < 1"):
+        trinary(np.zeros((1, 1)), occupied_above=occupied_above, free_below=free_below)
+
+
+def test_log_odds_of_another_shape_than_the_grid_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"log_odds: expected shape \(3, 4\), got \(4, 3\)"):
+        save_map(tmp_path, np.zeros((4, 3)), GridSpec((0.0, 0.0), 1.0, (3, 4)))
+    assert not list(tmp_path.iterdir())
+
+
+# --- What others wrote ---
+
+
+def test_a_sheet_and_picture_worked_by_hand(tmp_path):
+    loaded = load_map(written(tmp_path))
+    # (255 - 100) / 255 = 0.61 is unknown; the lower row of the picture is row 0.
+    np.testing.assert_array_equal(loaded.cells, [[UNKNOWN, UNKNOWN, UNKNOWN], [OCCUPIED, FREE, UNKNOWN]])
+    assert loaded.spec == GridSpec((1.0, 2.0), 0.5, (2, 3))
+
+
+def test_a_negated_picture_has_light_walls(tmp_path):
+    loaded = load_map(written(tmp_path, SHEET.replace("negate: 0", "negate: 1")))
+    # 0/255 is free, 254/255 and 205/255 = 0.8 occupied, 100/255 = 0.39 unknown.
+    np.testing.assert_array_equal(loaded.cells, [[UNKNOWN, OCCUPIED, OCCUPIED], [FREE, OCCUPIED, OCCUPIED]])
+
+
+def test_the_sheet_s_thresholds_decide(tmp_path):
+    loaded = load_map(written(tmp_path, SHEET.replace("0.65", "0.6").replace("0.196", "0.2")))
+    np.testing.assert_array_equal(loaded.cells, [[OCCUPIED, FREE, FREE], [OCCUPIED, FREE, FREE]])
+
+
+@pytest.mark.parametrize(
+    "header",
+    [b"P5 3 2 255 ", b"P5\n# made by a camera\n3 2\n255\n", b"P5\n3 # columns\n2\n# 9 9\n255\n", b"P5\r\n3\t2\n255\n"],
+)
+def test_white_space_and_comments_in_the_picture_s_header_are_skipped(tmp_path, header):
+    np.testing.assert_array_equal(
+        load_map(written(tmp_path, picture=header + GREYS)).cells, load_map(written(tmp_path)).cells
+    )
+
+
+def test_pixels_that_look_like_white_space_are_pixels(tmp_path):
+    loaded = load_map(written(tmp_path, picture=b"P5\n3 2\n255\n" + b"\n \t\r\n#"))
+    np.testing.assert_array_equal(loaded.cells, np.full((2, 3), OCCUPIED))
+
+
+# --- Damage ---
+
+
+@pytest.mark.parametrize("field", ["image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"])
+def test_a_missing_field_is_named(tmp_path, field):
+    lines = [line for line in SHEET.splitlines() if not line.startswith(field)]
+    with pytest.raises(ValueError, match=rf"map\.yaml: expected the fields .*missing {field}$"):
+        load_map(written(tmp_path, "\n".join(lines)))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[1, 2, 0]", "[1, 2, 0.1]", "origin without rotation, got 0.1 rad"),
+        ("[1, 2, 0]", "[1, 2, .nan]", "origin without rotation"),
+        ("[1, 2, 0]", "[1, 2]", "an origin of three"),
+        ("[1, 2, 0]", "3", "an origin of three"),
+        ("[1, 2, 0]", "[.inf, 2, 0]", "origin: expected two finite"),
+        ("0.5", "wide", "expected numbers"),
+        ("0.5", "-0.5", "resolution: expected metres per cell > 0"),
+        ("0.5", ".nan", "resolution: expected metres per cell > 0"),
+        ("negate: 0", "negate: maybe", "expected numbers"),
+        ("0.65", "[1]", "expected numbers"),
+        ("image: map.pgm", "image: map.pgm\nmode: scale", "expected mode trinary, got scale"),
+        ("image: map.pgm", "image: [", "expected a map_server YAML"),
+        (SHEET, "", "expected the fields"),
+        (SHEET, "- 1\n- 2\n", "expected the fields"),
+        (SHEET, "just words", "expected the fields"),
+    ],
+)
+def test_a_damaged_sheet_is_refused_by_name(tmp_path, old, new, message):
+    with pytest.raises(ValueError, match=rf"map\.yaml: .*{message}"):
+        load_map(written(tmp_path, SHEET.replace(old, new)))
+
+
+def test_a_sheet_that_is_no_text_is_refused(tmp_path):
+    path = written(tmp_path)
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"map\.yaml: expected a map_server YAML"):
+        load_map(path)
+
+
+def test_nothing_in_a_sheet_is_executed(tmp_path):
+    trap = tmp_path / "trap"
+    command = f"!!python/object/apply:os.mkdir ['{trap}']"
+    with pytest.raises(ValueError, match=r"map\.yaml: expected a map_server YAML"):
+        load_map(written(tmp_path, SHEET.replace("negate: 0", f"negate: {command}")))
+    assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (b"P2\n3 2\n255\n" + GREYS, "binary 8-bit PGM"),
+        (b"P6\n3 2\n255\n" + GREYS, "binary 8-bit PGM"),
+        (b"P5\n3 2\n65535\n" + 2 * GREYS, "binary 8-bit PGM"),
+        (b"P5\n3 2\n", "binary 8-bit PGM"),
+        (b"P5\n3 two\n255\n" + GREYS, "binary 8-bit PGM"),
+        (b"P5\n# no end", "binary 8-bit PGM"),
+        (b"P5\n-3 2\n255\n" + GREYS, "binary 8-bit PGM"),
+        (b"", "binary 8-bit PGM"),
+        (b"P5\n3 2\n255\n" + GREYS[:-1], "expected 2 x 3 pixels, got 5 bytes"),
+        (b"P5\n3 2\n255\n" + GREYS + b"\n", "expected 2 x 3 pixels, got 7 bytes"),
+        (b"P5\n0 0\n255\n", "expected 0 x 0 pixels, got 0 bytes"),
+    ],
+)
+def test_a_damaged_picture_is_refused_by_name(tmp_path, picture, message):
+    with pytest.raises(ValueError, match=rf"map\.pgm: .*{message}"):
+        load_map(written(tmp_path, picture=picture))
+
+
+def test_a_missing_file_is_missing(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_map(tmp_path / "no.yaml")
+    path = written(tmp_path)
+    (tmp_path / "map.pgm").unlink()
+    with pytest.raises(FileNotFoundError):
+        load_map(path)

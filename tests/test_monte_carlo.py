@@ -1,0 +1,183 @@
+"""The map over runs against a plain Python loop, whatever the chunk, the devices and the number of runs."""
+
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlocmap.monte_carlo import monte_carlo, use_all_cores
+
+
+class Outcome(NamedTuple):
+    mean: jax.Array  # ()
+    walk: jax.Array  # (3,)
+    positive: jax.Array  # () bool
+
+
+def one_run(key, scale, shift):
+    """A small run: a random walk of three steps."""
+    walk = shift + scale * jnp.cumsum(jax.random.normal(key, (3,)))
+    return Outcome(walk.mean(), walk, walk[-1] > 0)
+
+
+KEY, ARGS = jax.random.key(7), (2.0, 0.5)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    """Every run of the study in a Python loop, stacked."""
+    args = tuple(map(jnp.asarray, ARGS))
+    alone = jax.jit(one_run)
+    runs = [alone(jax.random.fold_in(KEY, i), *args) for i in range(23)]
+    return jax.tree.map(lambda *each: np.stack(each), *runs)
+
+
+def assert_close(got, expected, rtol):
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol), got, expected)
+
+
+def sums(runs):
+    return jax.tree.map(lambda x: x.sum(0, dtype=np.float64), runs)
+
+
+# --- What comes back ---
+
+
+@pytest.mark.parametrize(("runs", "chunk"), [(23, 256), (23, 23), (23, 7), (23, 1), (1, 4), (8, 4)])
+def test_the_sums_are_those_of_a_python_loop(loop, runs, chunk, tolerance):
+    # The chunk changes the order of the additions and the vector code of the runs: rounding, nothing more.
+    value = monte_carlo(one_run, KEY, runs, *ARGS, chunk=chunk).value
+    assert_close(value, sums(jax.tree.map(lambda x: x[:runs], loop)), tolerance(1e-13, 1e-5))
+    assert {leaf.dtype for leaf in jax.tree.leaves(value)} == {np.dtype(np.float64)}
+
+
+@pytest.mark.parametrize("chunk", [256, 7, 1])
+def test_kept_runs_are_those_of_a_python_loop_in_order(loop, chunk, tolerance):
+    value = monte_carlo(one_run, KEY, 23, *ARGS, chunk=chunk, keep_runs=True).value
+    assert value.walk.shape == (23, 3)
+    assert_close(value._replace(positive=0), loop._replace(positive=0), tolerance(1e-13, 1e-5))
+    np.testing.assert_array_equal(value.positive, loop.positive)
+
+
+def test_a_run_does_not_depend_on_how_many_follow(tolerance):
+    few, many = (monte_carlo(one_run, KEY, runs, *ARGS, chunk=8, keep_runs=True).value for runs in (5, 11))
+    assert_close(few.walk, many.walk[:5], tolerance(1e-13, 1e-5))
+
+
+def test_runs_differ_and_another_key_is_another_study():
+    first, other = (
+        monte_carlo(one_run, jax.random.key(seed), 11, *ARGS, chunk=8, keep_runs=True).value.walk for seed in (1, 2)
+    )
+    assert len(np.unique(np.concatenate([first, other])[:, 0])) == 22
+
+
+def test_runs_past_the_end_of_the_study_are_not_counted_even_if_they_are_no_number():
+    # Run 5 is the first that only fills up the last chunk.
+    def spoiled(key, last):
+        return jnp.where(jnp.all(jax.random.key_data(key) == last), jnp.nan, 1.0)
+
+    past = jax.random.key_data(jax.random.fold_in(KEY, 5))
+    assert monte_carlo(spoiled, KEY, 5, past, chunk=3).value == 5
+    assert np.isnan(monte_carlo(spoiled, KEY, 6, past, chunk=3).value)
+
+
+def test_totals_over_chunks_are_added_in_double_precision():
+    def one_large(key, large):
+        return jnp.where(jnp.all(jax.random.key_data(key) == large), jnp.float32(2**24), jnp.float32(1))
+
+    # In float32, 2^24 + 1 is 2^24.
+    first = jax.random.key_data(jax.random.fold_in(KEY, 0))
+    assert monte_carlo(one_large, KEY, 4, first, chunk=1).value == 2**24 + 3
+
+
+def test_progress_counts_the_runs_done():
+    done = []
+    monte_carlo(one_run, KEY, 23, *ARGS, chunk=7, progress=done.append)
+    assert done == [7, 14, 21, 23]
+
+
+@pytest.mark.parametrize(("name", "runs", "chunk"), [("runs", 0, 8), ("runs", -1, 8), ("chunk", 5, 0)])
+def test_a_study_of_nothing_is_refused(name, runs, chunk):
+    with pytest.raises(ValueError, match=f"{name}: expected at least 1, got"):
+        monte_carlo(one_run, KEY, runs, *ARGS, chunk=chunk)
+
+
+# --- Compiling ---
+
+
+def test_a_study_is_compiled_once_whatever_its_values():
+    traces = []
+
+    def traced(key, scale):
+        traces.append(scale.shape)
+        return scale * jax.random.normal(key)
+
+    first = monte_carlo(traced, KEY, 8, 1.0, chunk=4)
+    assert first.compile_s > 0
+    assert len(traces) == 1
+    again = monte_carlo(traced, KEY, 8, 1.0, chunk=4)
+    changed = monte_carlo(traced, jax.random.key(3), 80, 2.0, chunk=4)
+    assert len(traces) == 1
+    assert again.compile_s == changed.compile_s == 0
+    assert again.value == first.value != changed.value
+    # Another shape is another program.
+    monte_carlo(traced, KEY, 8, np.ones(2), chunk=4)
+    assert len(traces) == 2
+
+
+# --- Devices ---
+
+SCRIPT = """
+    import jax, jax.numpy as jnp, numpy as np
+    from jaxlocmap.monte_carlo import monte_carlo, use_all_cores
+
+    if {two}:
+        jax.config.update("jax_num_cpu_devices", 2)
+    else:
+        assert use_all_cores() == len(jax.local_devices()) == {cores}
+        assert use_all_cores() == {cores}  # once more changes nothing
+    jax.config.update("jax_enable_x64", True)
+
+    def one_run(key, scale):
+        return scale * jnp.cumsum(jax.random.normal(key, (3,)))
+
+    key, devices = jax.random.key(0), jax.local_devices()
+    one = monte_carlo(one_run, key, 13, 2.0, chunk=3, devices=devices[:1])
+    every = monte_carlo(one_run, key, 13, 2.0, chunk=3)
+    np.testing.assert_allclose(every.value, one.value, rtol=1e-13)
+    one = monte_carlo(one_run, key, 13, 2.0, chunk=3, keep_runs=True, devices=devices[:1])
+    every = monte_carlo(one_run, key, 13, 2.0, chunk=3, keep_runs=True)
+    assert every.value.shape == (13, 3)
+    np.testing.assert_allclose(every.value, one.value, rtol=1e-13)
+    done = []
+    monte_carlo(one_run, key, 13, 2.0, chunk=3, progress=done.append)
+    assert done == [min(3 * len(devices) * (i + 1), 13) for i in range(len(done))], done
+    assert done[-1] == 13
+    print(len(devices), "devices")
+"""
+
+
+@pytest.mark.parametrize("two", [True, False], ids=["two_devices", "all_cores"])
+def test_all_devices_together_give_what_one_gives(two):
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    script = textwrap.dedent(SCRIPT.format(two=two, cores=cores))
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(Path(__file__).parents[1])}
+    environment.pop("XLA_FLAGS", None)
+    process = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert process.returncode == 0, process.stderr
+    assert process.stdout == f"{2 if two else cores} devices\n"
+
+
+def test_asking_for_all_cores_too_late_leaves_the_devices_as_they_are():
+    before = jax.local_devices()
+    assert use_all_cores() == len(before)
+    assert jax.local_devices() == before
