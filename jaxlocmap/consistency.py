@@ -19,6 +19,7 @@ from jaxlocmap.motion import wrap
 
 POSE_DIMENSION = 3
 COVERAGE_LEVELS = (0.50, 0.90, 0.95, 0.99)
+_NEAR = 1.25  # a misfit that a single run, whose errors are correlated in time, cannot tell from none
 
 
 def pose_error(truth: jax.Array, estimate: jax.Array) -> jax.Array:
@@ -145,12 +146,14 @@ def verdict(anees: float, band: tuple[float, float] | None = None, diverged: int
     small = anees < POSE_DIMENSION
     ratio = (POSE_DIMENSION / anees if anees > 0 else math.inf) if small else anees / POSE_DIMENSION
     if band is not None and band[0] <= anees <= band[1]:
-        text = f"consistent: ANEES {anees:.3g} lies in its 95 % band [{band[0]:.3g}, {band[1]:.3g}]"
-    else:
-        side, size = ("under-confident", "large") if small else ("over-confident", "small")
-        where = "" if band is None else f", 95 % band [{band[0]:.3g}, {band[1]:.3g}]"
-        text = f"{side}: covariance {ratio:.3g} times too {size} (ANEES {anees:.3g}, 3 expected{where})"
-    return text + lost
+        opening = "not consistent" if diverged else "consistent"
+        return f"{opening}: ANEES {anees:.3g} lies in its 95 % band [{band[0]:.3g}, {band[1]:.3g}]{lost}"
+    where = "one run gives no band" if band is None else f"95 % band [{band[0]:.3g}, {band[1]:.3g}]"
+    judged = f"(ANEES {anees:.3g}, 3 expected, {where}){lost}"
+    if band is None and ratio < _NEAR:
+        return f"undecided: nothing speaks against the covariance {judged}"
+    side, size = ("under-confident", "large") if small else ("over-confident", "small")
+    return f"{side}: covariance {ratio:.3g} times too {size} {judged}"
 
 
 def gate_verdict(accept_rate: float, nominal: float | None, observations: int | None = None) -> str:

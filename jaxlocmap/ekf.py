@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import scipy.special
 
-from jaxlocmap import landmarks as sensor
 from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve
 from jaxlocmap.motion import MotionModel, wrap
 
@@ -105,7 +104,8 @@ def update(
     nis: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
     log_det = sum(jnp.log(d) for d in D)
     log_likelihood = -0.5 * (nis + log_det + m * jnp.log(2 * jnp.pi).astype(residual.dtype))
-    accepted = jnp.logical_and(nis < threshold, valid)  # a distance of NaN or infinity fails, with or without a gate
+    # A distance that is no number fails with or without a gate; so does an S that is not positive definite.
+    accepted = jnp.logical_and((nis < threshold) & jnp.isfinite(log_likelihood), valid)
 
     K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)  # S is symmetric: row i of K solves S k = (P Hᵀ)_i
     IKH = Matrix.identity(len(P.rows)) - K @ H
@@ -121,28 +121,3 @@ def update(
         accepted=accepted,
         log_likelihood=log_likelihood,
     )
-
-
-def correct(
-    mean: jax.Array,
-    cov: jax.Array,
-    z: jax.Array,
-    landmark: jax.Array,
-    R: jax.Array,
-    *,
-    threshold: float = float("inf"),
-    valid: jax.Array | bool = True,
-    sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> Update:
-    """`update` by the range and bearing of one known landmark.
-
-    Args:
-        mean: (3,) m, m, rad. cov: (3, 3). z: (2,) range m, bearing rad. landmark: (2,) m, world frame.
-        R: (2, 2) m², rad². threshold, valid: as in `update`. sensor_offset: (dx, dy, dtheta) in the body frame.
-
-    Returns:
-        An `Update`. A landmark that lies on the sensor has no bearing and is not accepted.
-        Source: Thrun, Burgard & Fox 2005, section 7.4.
-    """
-    residual, H, defined = sensor.linearise(mean, landmark, z, sensor_offset)
-    return update(mean, cov, residual, H, R, threshold=threshold, valid=valid & defined)

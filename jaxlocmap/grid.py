@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap.batching import any_in_batch
+from jaxlocmap.batching import any_in_batch, zero_like_any
 from jaxlocmap.types import GridSpec
 
 # Up to here, cells looked at times cells spanned, a float32 product places every cell of a beam exactly; beyond it
@@ -143,8 +143,9 @@ def update_log_odds(
     """
     # Cells that are not touched get zero added, each somewhere else: one shared address would serialise the adds.
     beams, cells = len(beam_angles), _beam_length(spec, max_range)
-    spread = jnp.arange(beams * cells, dtype=jnp.int32).reshape(beams, cells) % log_odds.size
-    zeros = jnp.zeros(spread.shape, log_odds.dtype)
+    zero = zero_like_any(log_odds, pose, ranges, beam_angles, l_occ, l_free)
+    spread = jnp.arange(beams * cells, dtype=jnp.int32).reshape(beams, cells) % log_odds.size + zero
+    zeros = jnp.full(spread.shape, zero.astype(log_odds.dtype))
 
     def change() -> tuple[jax.Array, jax.Array]:
         touched = beam_cells(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)

@@ -37,7 +37,8 @@ def observe(pose: jax.Array, landmark: jax.Array, sensor_offset: Offset = (0.0, 
         sensor_offset: (dx, dy, dtheta) m, m, rad in the body frame.
 
     Returns:
-        (2,) range m, bearing rad wrapped. Source: Thrun, Burgard & Fox 2005, section 6.6.
+        (2,) range m, bearing rad wrapped; no gradient where the landmark lies on the sensor.
+        Source: Thrun, Burgard & Fox 2005, section 6.6.
     """
     x, y, heading, _ = _sensor(pose, sensor_offset)
     dx, dy = landmark[0] - x, landmark[1] - y

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxlocmap import checks, ekf, grid
 from jaxlocmap import landmarks as sensor
-from jaxlocmap.batching import any_in_batch
+from jaxlocmap.batching import any_in_batch, zero_like_any
 from jaxlocmap.linalg import Matrix, is_psd
 from jaxlocmap.motion import resolve
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
@@ -85,11 +85,7 @@ def step(
     log_likelihood = state.log_likelihood + jnp.sum(slots.log_likelihood)
     info = Info(
         belief=belief,
-        innovation=slots.innovation,
-        S=slots.S,
-        nis=slots.nis,
-        accepted=slots.accepted,
-        log_likelihood=slots.log_likelihood,
+        **slots._asdict(),
         ok=moved & observed & is_psd(Matrix.of(belief.cov)) & jnp.all(jnp.isfinite(belief.mean)),
     )
     return State(belief, log_odds, log_likelihood), info
@@ -131,6 +127,9 @@ def run(
     """
     _check_run(params, inputs)
 
+    zero = zero_like_any(params, state, inputs, landmarks, beam_angles)
+    state = jax.tree.map(lambda x: x + zero.astype(x.dtype), state)
+
     def body(state: State, now: tuple[Inputs, Any]) -> tuple[State, Any]:
         state, info = step(params, state, now[0], landmarks=landmarks, beam_angles=beam_angles, config=config)
         return state, collect(state, info, now[1])
@@ -163,6 +162,10 @@ def map_scans(
     checks.shape("poses", poses, (None, 3))
     checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
 
+    zero = zero_like_any(params, log_odds, poses, ranges, beam_angles)
+    log_odds = log_odds + zero.astype(log_odds.dtype)
+    params = Params(*(jnp.asarray(x, log_odds.dtype) for x in params))
+
     def body(log_odds: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         return _update_map(params, log_odds, now[0], now[1], beam_angles, config), None
 
@@ -185,56 +188,60 @@ def _predict(params: Params, belief: Gaussian, inputs: Inputs, config: Config) -
     return Gaussian(mean, cov), usable
 
 
+class _Slots(NamedTuple):
+    """What the observation slots of one step report: the middle of `Info`."""
+
+    innovation: jax.Array
+    S: jax.Array
+    nis: jax.Array
+    accepted: jax.Array
+    log_likelihood: jax.Array
+    row: jax.Array
+
+
 def _correct_landmarks(
     params: Params, belief: Gaussian, inputs: Inputs, landmarks: jax.Array | None, config: Config
-) -> tuple[Gaussian, ekf.Update, jax.Array]:
-    """The belief after every slot in turn, what each slot reports (zero where empty), and whether all were usable."""
+) -> tuple[Gaussian, _Slots, jax.Array]:
+    """The belief after every slot in turn, what each slot reports, and whether every observation could be used."""
     slots = inputs.valid.shape[0]
-    dtype = belief.mean.dtype
-    nothing = ekf.Update(
-        mean=jnp.zeros((slots, 3), dtype),
-        cov=jnp.zeros((slots, 3, 3), dtype),
-        innovation=jnp.zeros((slots, 2), dtype),
-        S=jnp.zeros((slots, 2, 2), dtype),
-        nis=jnp.zeros(slots, dtype),
-        accepted=jnp.zeros(slots, bool),
-        log_likelihood=jnp.zeros(slots, dtype),
+    zero = zero_like_any(params, belief, inputs, landmarks)
+    real = zero.astype(belief.mean.dtype)
+    empty = _Slots(
+        innovation=jnp.full((slots, 2), real),
+        S=jnp.full((slots, 2, 2), real),
+        nis=jnp.full(slots, real),
+        accepted=jnp.full(slots, zero != 0),
+        log_likelihood=jnp.full(slots, real),
+        row=jnp.full(slots, zero - 1),
     )
     if landmarks is None or slots == 0:
-        return belief, nothing, jnp.array(True)
-    known = inputs.landmark < len(landmarks)
-    usable = inputs.valid & jnp.all(jnp.isfinite(inputs.z), axis=-1) & known
+        return belief, empty, jnp.array(True)
+    usable = inputs.valid & jnp.all(jnp.isfinite(inputs.z), axis=-1) & (inputs.landmark < len(landmarks))
     threshold = ekf.gate_threshold(config.gate_probability, 2)
 
-    def slot(belief: Gaussian, now: tuple[jax.Array, ...]) -> tuple[Gaussian, ekf.Update]:
-        z, landmark, usable = now
+    def slot(belief: Gaussian, now: tuple[Any, ...]) -> tuple[Gaussian, tuple[_Slots, jax.Array]]:
+        z, landmark, usable, empty = now
         row = jax.lax.cond(
             any_in_batch(usable & (landmark < 0)),
             lambda: jnp.where(
-                landmark < 0,
-                sensor.associate(*belief, z, landmarks, params.R, config.sensor_offset),
-                landmark,
+                landmark < 0, sensor.associate(*belief, z, landmarks, params.R, config.sensor_offset), landmark
             ),
             lambda: landmark,
         )
-        update = ekf.correct(
-            *belief,
-            z,
-            landmarks[jnp.maximum(row, 0)],
-            params.R,
-            threshold=threshold,
-            valid=usable,
-            sensor_offset=config.sensor_offset,
-        )
-        report = jax.tree.map(lambda x: jnp.where(usable, x, jnp.zeros_like(x)), update)
-        return Gaussian(update.mean, update.cov), report
+        residual, H, defined = sensor.linearise(belief.mean, landmarks[jnp.maximum(row, 0)], z, config.sensor_offset)
+        used = usable & defined
+        update = ekf.update(*belief, residual, H, params.R, threshold=threshold, valid=used)
+        report = _Slots(update.innovation, update.S, update.nis, update.accepted, update.log_likelihood, row)
+        report = jax.tree.map(lambda x, nothing: jnp.where(used, x, nothing), report, empty)
+        return Gaussian(update.mean, update.cov), (report, used & jnp.isfinite(update.log_likelihood))
 
-    def correct() -> tuple[Gaussian, ekf.Update]:
+    def correct() -> tuple[Gaussian, tuple[_Slots, jax.Array]]:
         z = jnp.where(usable[:, None], inputs.z, 0)
-        return jax.lax.scan(slot, belief, (z, inputs.landmark, usable), unroll=min(slots, 4))
+        xs = (z, inputs.landmark.astype(jnp.int32), usable, empty)
+        return jax.lax.scan(slot, belief, xs, unroll=min(slots, 4))
 
-    belief, report = jax.lax.cond(any_in_batch(usable), correct, lambda: (belief, nothing))
-    return belief, report, jnp.all(usable == inputs.valid)
+    belief, (report, used) = jax.lax.cond(any_in_batch(usable), correct, lambda: (belief, (empty, usable)))
+    return belief, report, jnp.all(used == inputs.valid)
 
 
 def _update_map(

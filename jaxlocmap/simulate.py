@@ -146,8 +146,9 @@ def draw_pose(key: jax.Array, prior: Gaussian) -> jax.Array:
 
     To start exactly where the filter believes, use `prior.mean`.
     """
-    L = jnp.linalg.cholesky(prior.cov)
-    pose = prior.mean + L @ jax.random.normal(key, (3,), prior.mean.dtype)
+    variance, axes = jnp.linalg.eigh(prior.cov)  # unlike Cholesky, content with a variance of zero
+    spread = jnp.sqrt(jnp.maximum(variance, 0)) * jax.random.normal(key, (3,), prior.mean.dtype)
+    pose = prior.mean + axes @ spread
     return pose.at[2].set(wrap(pose[2]))
 
 

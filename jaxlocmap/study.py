@@ -18,7 +18,10 @@ from jaxlocmap import consistency, grid, simulate
 from jaxlocmap.pipeline import init, run
 from jaxlocmap.types import Config, Gaussian, Info, Params, State
 
-_DIVERGED = 1.0  # m: a run that ends further than this from the truth has lost the robot
+# A run has lost the robot where it is further off than this, and all but excludes that itself. The second half spares
+# a filter that has seen nothing for long and says so.
+_LOST_DISTANCE = 1.0  # m
+_LOST_NEES = consistency.chi2_quantile(1 - 1e-6, consistency.POSE_DIMENSION)
 
 
 class MapTotals(NamedTuple):
@@ -54,7 +57,7 @@ class Totals(NamedTuple):
     lag_squares: jax.Array  # (2,)
     lag_pairs: jax.Array  # ()
     flagged_steps: jax.Array  # () steps whose `Info.ok` is False
-    diverged: jax.Array  # () 1 if the run ended lost
+    diverged: jax.Array  # () 1 if the run lost the robot at any step, or ended without a finite belief
     map: MapTotals | None
 
 
@@ -126,9 +129,9 @@ def _totals(steps: _Scored, valid: jax.Array, map_totals: MapTotals | None) -> T
     run_nis = jnp.sum(steps.nis) / jnp.maximum(observed, 1)
     quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
     products, squares, pairs = consistency.lag_one(steps.white, steps.measured)
-    last = steps.error[-1]
-    # A comparison with NaN is False, so a run that ended without a number, or without a covariance, counts as lost.
-    kept = (last[0] ** 2 + last[1] ** 2 <= _DIVERGED**2) & jnp.all(jnp.isfinite(steps.variance[-1]))
+    far = steps.error[:, 0] ** 2 + steps.error[:, 1] ** 2 > _LOST_DISTANCE**2
+    ended = jnp.all(jnp.isfinite(steps.error[-1])) & jnp.all(jnp.isfinite(steps.variance[-1]))
+    diverged = jnp.any(far & (nees > _LOST_NEES)) | ~ended
     return Totals(
         runs=jnp.ones((), dtype),
         scored_runs=jnp.any(scored).astype(dtype),
@@ -149,7 +152,7 @@ def _totals(steps: _Scored, valid: jax.Array, map_totals: MapTotals | None) -> T
         lag_squares=squares,
         lag_pairs=pairs,
         flagged_steps=jnp.sum(~steps.ok).astype(dtype),
-        diverged=(~kept).astype(dtype),
+        diverged=diverged.astype(dtype),
         map=map_totals,
     )
 
@@ -181,7 +184,8 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
         totals: `Totals` of NumPy arrays, summed over runs. config: the filter's.
 
     Returns:
-        The statistics by name, ready for JSON. `anees_band_95` comes from the spread between runs around 3;
+        The statistics by name, ready for JSON. The lag-one value of "bearing" is that of the bearing given the range,
+        since innovations are whitened in that order. `anees_band_95` comes from the spread between runs around 3;
         `nees_band_95` is the χ² band of one step's mean over runs, and `nees_steps_in_band` the share of steps in it.
     """
     runs = round(float(totals.runs))
@@ -195,6 +199,7 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
     band = consistency.chi2_band(consistency.POSE_DIMENSION, runs)
     rms = np.sqrt(totals.error_square.sum(0) / all_scored)
     rate = float(totals.accepted.sum()) / observations if observations else math.nan
+    variance = np.where(totals.scored.any(), totals.variance.sum(0), np.nan)
     lag = totals.lag_products / np.where(totals.lag_squares > 0, totals.lag_squares, np.nan)
     diverged = round(float(totals.diverged))
     observing = totals.observed > 0
@@ -218,6 +223,10 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
         ],
         "rmse_per_step": np.sqrt(totals.error_square / scored[:, None]).tolist(),
         "sigma_per_step": np.sqrt(totals.variance / scored[:, None]).tolist(),
+        # Of each axis alone: below 1 the filter claims too much error, above 1 too little.
+        "error_over_sigma_square": dict(
+            zip(("x", "y", "yaw"), (totals.error_square.sum(0) / variance).tolist(), strict=True)
+        ),
         "within_two_sigma": dict(zip(("x", "y", "yaw"), (totals.within_two_sigma / all_scored).tolist(), strict=True)),
         **{
             f"coverage_{round(100 * level)}": float(count) / all_scored

@@ -18,7 +18,8 @@ from jaxlocmap import checks
 class Params(NamedTuple):
     """Everything that is tuned: the noise the filter believes in and the inverse sensor model.
 
-    All leaves are arrays, so a batch of parameters is a `vmap` and a gradient is a `grad`.
+    All leaves are arrays, so a batch of parameters is a `vmap` and a gradient is a `grad`. The filter reads the upper
+    triangles of Q and R, so a gradient by an off-diagonal entry stands in the upper triangle alone.
     """
 
     Q: jax.Array  # (2, 2) covariance of (v, omega) over one nominal period, (m/s)^2, (rad/s)^2
@@ -175,7 +176,7 @@ class Inputs(NamedTuple):
 
     dt: jax.Array  # (T,) s, >= 0
     control: jax.Array  # (T, 2) v m/s, omega rad/s
-    landmark: jax.Array  # (T, M) int32: row of `landmarks`, -1 for unknown
+    landmark: jax.Array  # (T, M) int32: row of `landmarks`, -1 (or any below 0) for unknown
     z: jax.Array  # (T, M, 2) range m, bearing rad
     valid: jax.Array  # (T, M) bool: the slot holds an observation
     ranges: jax.Array | None = None  # (T, B) m; None without a scanner
@@ -190,7 +191,7 @@ class State(NamedTuple):
 
 
 class Info(NamedTuple):
-    """What one step reports. Entries of empty slots are zero."""
+    """What one step reports. Entries of empty slots are zero. What the gate refuses is no fault: see `accepted`."""
 
     belief: Gaussian  # after the step's corrections
     innovation: jax.Array  # (M, 2) m, rad: z minus its prediction, bearing wrapped
@@ -198,6 +199,7 @@ class Info(NamedTuple):
     nis: jax.Array  # (M,) squared Mahalanobis distance of the innovation, gated or not
     accepted: jax.Array  # (M,) bool: the gate let it in
     log_likelihood: jax.Array  # (M,) nats: log density of the innovation, gated or not
+    row: jax.Array  # (M,) int32: row of `landmarks` the observation was taken for, -1 in an empty slot
     ok: jax.Array  # () bool: inputs finite, covariance positive semi-definite
 
 

@@ -492,9 +492,7 @@ def course_run(seed=4, motion="capstone", conventions="course", gate=COURSE_GATE
 
     log_odds = np.zeros(COURSE_GRID_SHAPE)
     for estimate, ranges in zip(filtered["mean"], scans, strict=True):
-        log_odds = update_scan(
-            log_odds, estimate, ranges, COURSE_ANGLES, **COURSE_SCAN, conventions=conventions
-        )
+        log_odds = update_scan(log_odds, estimate, ranges, COURSE_ANGLES, **COURSE_SCAN, conventions=conventions)
 
     error = truth - filtered["mean"]
     error[:, 2] = wrap(error[:, 2])

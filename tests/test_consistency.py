@@ -227,8 +227,8 @@ def test_a_chi2_band_over_runs_times_steps_does_not_hold_it():
             "under-confident: covariance 2 times too large (ANEES 1.5, 3 expected, 95 % band [2.9, 3.1])",
         ),
         (12.0, (2.9, 3.1), "over-confident: covariance 4 times too small (ANEES 12, 3 expected, 95 % band [2.9, 3.1])"),
-        (12.0, None, "over-confident: covariance 4 times too small (ANEES 12, 3 expected)"),
-        (2.0, None, "under-confident: covariance 1.5 times too large (ANEES 2, 3 expected)"),
+        (12.0, None, "over-confident: covariance 4 times too small (ANEES 12, 3 expected, one run gives no band)"),
+        (2.0, None, "under-confident: covariance 1.5 times too large (ANEES 2, 3 expected, one run gives no band)"),
         (
             0.0,
             (2.9, 3.1),
@@ -244,12 +244,15 @@ def test_the_verdict_names_the_side_and_size_of_the_misfit(anees, band, expected
 
 @pytest.mark.parametrize("anees", [0.1, 3.0, 47.0])
 def test_a_run_without_a_band_is_never_called_consistent(anees):
-    assert not consistency.verdict(anees, (-math.inf, math.inf)).startswith("consistent")
+    text = consistency.verdict(anees, (-math.inf, math.inf))
+    assert text.startswith({0.1: "under-confident", 3.0: "undecided", 47.0: "over-confident"}[anees])
+    assert "one run gives no band" in text
 
 
 @pytest.mark.parametrize("anees", [3.0, 1.0, 9.0, math.nan])
 def test_diverged_runs_are_in_every_verdict(anees):
     assert consistency.verdict(anees, (2.9, 3.1), 4, 100).endswith("; 4 of 100 runs diverged")
+    assert not consistency.verdict(anees, (2.9, 3.1), 4, 100).startswith("consistent")
     assert "diverged" not in consistency.verdict(anees, (2.9, 3.1), 0, 100)
 
 

@@ -245,9 +245,7 @@ def test_mrclam_missing(tmp_path):
     missing = folder / "Robot1_Measurement.dat"
     refused(lambda: logs.read_mrclam(folder, 1), missing, error=FileNotFoundError)
     refused(lambda: logs.read_mrclam(tmp_path / "nowhere", 1), "nowhere", error=FileNotFoundError)
-    refused(
-        lambda: logs.read_mrclam(missing.with_name("Barcodes.dat"), 1), "Barcodes.dat: expected the folder"
-    )
+    refused(lambda: logs.read_mrclam(missing.with_name("Barcodes.dat"), 1), "Barcodes.dat: expected the folder")
     refused(lambda: logs.read_mrclam(tmp_path, 1), "robots there: none")
 
 
@@ -314,9 +312,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize(
-    "kind", ["missing", "folder", "empty", "short gzip", "no gzip", "damaged gzip", "pickle"]
-)
+@pytest.mark.parametrize("kind", ["missing", "folder", "empty", "short gzip", "no gzip", "damaged gzip", "pickle"])
 def test_unreadable_files(tmp_path, reader, kind):
     mrclam(tmp_path)
     path = tmp_path / "Robot1_Odometry.dat"
@@ -337,9 +333,7 @@ def test_matlab_numbers_of_every_kind(tmp_path, packed):
     rng = np.random.default_rng(0)
     kinds = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "?"]
     shapes = [(1, 1), (1, 3), (5, 1), (3, 4), (0, 2), (2, 3, 4)]
-    wanted = {
-        f"{k}_{len(s)}_{n}": (100 * rng.random(s)).astype(k) for k in kinds for n, s in enumerate(shapes)
-    }
+    wanted = {f"{k}_{len(s)}_{n}": (100 * rng.random(s)).astype(k) for k in kinds for n, s in enumerate(shapes)}
     wanted = {name.replace("?", "bool"): value for name, value in wanted.items()}
     path = tmp_path / "a.mat"
     scipy.io.savemat(path, wanted | {"other": "text", "more": {"a": [1, "b"]}}, do_compression=packed)
@@ -427,9 +421,7 @@ def test_garbage_is_refused_or_read_but_nothing_else(tmp_path_factory, cut, junk
 def test_read_dispatch(tmp_path):
     assert len(logs.read(woods(tmp_path / "log.mat"), "woods").landmarks) == 2
     refused(lambda: logs.read(tmp_path, "rosbag"), "expected one of woods, mrclam, carmen, got 'rosbag'")
-    refused(
-        lambda: logs.read(tmp_path, "mrclam"), "robot: expected a robot's number for format mrclam, got None"
-    )
+    refused(lambda: logs.read(tmp_path, "mrclam"), "robot: expected a robot's number for format mrclam, got None")
     refused(lambda: logs.read(tmp_path, "woods", 1), "robot: expected None: only mrclam has several")
 
 
@@ -604,9 +596,7 @@ def test_truth_between_samples():
     assert np.all((known >= -math.pi) & (known < math.pi))
 
 
-@pytest.mark.parametrize(
-    "heading", [np.nextafter(-math.pi, -4), math.pi, -math.pi, 3 * math.pi, -1e-20, 100.0]
-)
+@pytest.mark.parametrize("heading", [np.nextafter(-math.pi, -4), math.pi, -math.pi, 3 * math.pi, -1e-20, 100.0])
 def test_headings_stay_below_pi(heading):
     found = logs.to_timeline(log_of(odometry=[(1, 0, 0)], truth=[(1, 0, 0, heading)])).truth[0, 2]
     assert -math.pi <= found < math.pi

@@ -12,7 +12,21 @@ import reference
 from jax.sharding import Mesh, PartitionSpec
 from jax.test_util import check_grads
 
-from jaxlocmap import Config, GridSpec, Inputs, Params, ekf, grid, init, landmarks, map_scans, motion, run, step
+from jaxlocmap import (
+    Config,
+    Gaussian,
+    GridSpec,
+    Inputs,
+    Params,
+    ekf,
+    grid,
+    init,
+    landmarks,
+    map_scans,
+    motion,
+    run,
+    step,
+)
 
 GATE = ekf.gate_threshold(0.99, 2)
 STEPS = 12  # of a short run: the course's detector looks at steps 0, 5 and 10
@@ -349,7 +363,6 @@ def test_a_config_made_anew_does_not_compile_again(short):
 
 
 def test_shard_map_over_runs_needs_no_wrapper(short, config):
-    """With `check_vma=False`: the two sides of a branch may differ in what varies over devices."""
     runs = variants(short)
     inputs = jax.tree.map(lambda *x: jnp.stack(x), *(c.inputs for c in runs))
     state = init(short.prior, config=config)
@@ -363,10 +376,36 @@ def test_shard_map_over_runs_needs_no_wrapper(short, config):
         mesh=Mesh(np.array(jax.devices()), ("runs",)),
         in_specs=(PartitionSpec(), over_runs, PartitionSpec()),
         out_specs=over_runs,
-        check_vma=False,
     )
     got = jax.jit(sharded)(short.params, inputs, short.landmarks)
     chex.assert_trees_all_close(got, localise_batch(runs, config), rtol=1e-6, atol=1e-6)
+
+
+def test_a_landmark_on_the_sensor_is_flagged_and_not_used(short, config):
+    """Of two observations at step 0 the first is of the spot the robot stands on; the second goes on as usual."""
+    prior = Gaussian(jnp.array([1.0, 2.0, 0.0]), jnp.eye(3) * 1e-4)
+    inputs = edit(
+        short,
+        control=jnp.zeros((STEPS, 2)),
+        landmark=jnp.broadcast_to(jnp.arange(SLOTS, dtype=jnp.int32), (STEPS, SLOTS)),
+        valid=jnp.zeros((STEPS, SLOTS), bool).at[0, :2].set(True),
+        z=jnp.ones((STEPS, SLOTS, 2)),
+    ).inputs
+    marks = short.landmarks.at[0].set(jnp.array([1.0, 2.0])).at[1].set(jnp.array([2.0, 2.0]))
+    _, info = run(short.params, init(prior, config=config), inputs, landmarks=marks, config=config)
+    assert info.ok.tolist() == [False] + [True] * (STEPS - 1)
+    assert float(info.nis[0, 0]) == 0
+    assert float(info.nis[0, 1]) > 0
+    assert info.row[0].tolist() == [-1, 1, *[-1] * (SLOTS - 2)]
+
+
+def test_info_says_which_landmark_an_anonymous_observation_was_taken_for(short, config):
+    valid = np.asarray(short.inputs.valid)
+    anonymous = edit(short, landmark=jnp.full_like(short.inputs.landmark, -1))
+    for course in (short, anonymous):
+        _, info = localise(course, config)
+        np.testing.assert_array_equal(np.asarray(info.row)[valid], np.asarray(short.inputs.landmark)[valid])
+        assert np.all(np.asarray(info.row)[~valid] == -1)
 
 
 def test_collect_keeps_what_it_is_asked_for_with_what_lies_aside(short, config):
@@ -425,7 +464,7 @@ def test_every_atom_keeps_float32(single):
         return {
             "transition": [model.transition(mean, control, dt) for model in motion.MODELS.values()],
             "predict": ekf.predict(mean, cov, control, dt, params.Q, motion=motion.ARC, nominal_dt=0.1),
-            "correct": ekf.correct(mean, cov, z, mark, params.R, threshold=GATE, sensor_offset=offset),
+            "update": ekf.update(mean, cov, residual, H, params.R, threshold=GATE),
             "sensor": [residual, H.array(jnp.float32), landmarks.observe(mean, mark, offset)],
             "wheels": [motion.from_wheels(dt, z[0], 0.4), motion.to_wheels(control, 0.4)],
             "map": [log_odds, grid.probability(log_odds), grid.entropy_bits(log_odds)],

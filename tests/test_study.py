@@ -404,15 +404,27 @@ def test_a_run_that_maps_nothing_has_no_brier_score_and_spoils_none(faulty):
     assert both["map"]["calibration_error"] == healthy["map"]["calibration_error"]
 
 
-def test_runs_that_end_a_metre_off_are_lost():
+def test_runs_that_are_a_metre_off_and_exclude_it_at_any_step_are_lost():
     runs = jax.tree.map(np.asarray, STUDY(*batch(("wild",) * len(FAULTS))))
-    off = runs.error_square[..., :2].sum(-1) > 1
-    assert 0 < off[:, -1].sum() < len(FAULTS)
-    assert np.any(off[:, -1] != off[:, 0])  # where it ends, not where it began
-    np.testing.assert_array_equal(runs.diverged, off[:, -1])
+    far, excluded = runs.error_square[..., :2].sum(-1) > 1, runs.nees > scipy.stats.chi2(3).ppf(1 - 1e-6)
+    lost = np.any(far & excluded, axis=1)
+    assert lost.sum() > 0
+    assert np.any(lost & ~(far & excluded)[:, -1])  # found again at the end, and yet counted
+    np.testing.assert_array_equal(runs.diverged, lost)
     report = summarise(sums(runs), SHORT_CONFIG)
     assert report["verdict"].startswith("over-confident")
-    assert report["verdict"].endswith(f"; {off[:, -1].sum()} of {len(FAULTS)} runs diverged")
+    assert report["verdict"].endswith(f"; {lost.sum()} of {len(FAULTS)} runs diverged")
+
+
+def test_a_run_that_is_far_off_and_says_so_is_not_lost():
+    """Dead reckoning by a speedometer that is 30 m/s off, and known to be."""
+    blind = dataclasses.replace(SHORT, name="blind", sight_range=0.0)
+    study = Study(blind, blind.config(motion="euler", grid=False))
+    params = Params.from_std(**PLANT | {"v": 30.0})
+    world, noise, prior = simulate.room(), Noise(v=30.0), blind.prior()
+    report = summarise(monte_carlo(study, jax.random.key(0), 50, params, world, noise, prior).value, study.config)
+    assert report["rmse_position_m"] > 5
+    assert report["diverged_runs"] == 0
 
 
 def test_every_fault_is_counted_and_none_makes_the_study_no_number(faulty):
