@@ -137,10 +137,7 @@ def _print(report: dict[str, Any]) -> None:
             (f"{level} % ellipsoid holds", f"{100 * report[f'coverage_{level}']:.1f} %", f"{level} %")
             for level in (50, 90, 95, 99)
         ),
-        *(
-            (f"{axis}: error² over σ²", f"{ratio:.3f}", "1")
-            for axis, ratio in report["error_over_sigma_square"].items()
-        ),
+        *((f"{axis} alone: error² over σ²", f"{nees:.3f}", "1") for axis, nees in report["axis_nees"].items()),
         *(
             (f"{axis} within ±2σ", f"{100 * share:.1f} %", "95.4 %")
             for axis, share in report["within_two_sigma"].items()

@@ -283,6 +283,7 @@ def reference_totals(key):
         nees=nees,
         error_square=error**2,
         variance=variance,
+        axis_nees=(error**2 / variance).sum(0),
         within_two_sigma=(np.abs(error) <= 2 * np.sqrt(variance)).sum(0),
         covered=[(nees < scipy.stats.chi2.ppf(level, 3)).sum() for level in COVERAGE_LEVELS],
         run_nees=[nees.mean(), nees.mean() ** 2],
@@ -460,6 +461,7 @@ def hand_made():
         nees=np.array([8.0, 4.0]),
         error_square=np.array([[0.02, 0.03, 0.2], [0.06, 0.05, 0.12]]),
         variance=np.array([[0.08, 0.02, 0.5], [0.5, 0.72, 0.02]]),
+        axis_nees=np.array([2.0, 4.0, 6.0]),
         within_two_sigma=np.array([4.0, 3.0, 2.0]),
         covered=np.array([1.0, 2.0, 3.0, 4.0]),
         run_nees=np.array([6.0, 20.0]),  # averages 2 and 4
@@ -497,6 +499,7 @@ def test_a_report_of_totals_made_by_hand():
         "nees_per_step": [4.0, 2.0],
         "nees_steps_in_band": 1.0,
         "nis_per_step": [None, 2.5],
+        "axis_nees": {"x": 0.5, "y": 1.0, "yaw": 1.5},
         "within_two_sigma": {"x": 1.0, "y": 0.75, "yaw": 0.5},
         "coverage_50": 0.25,
         "coverage_90": 0.5,
