@@ -25,7 +25,7 @@ def command_line(main: Callable[[Any], Any], config: type) -> None:
     """Read `config` from the command line and run `main`; a mistake of the user's is one line, not a traceback."""
     try:
         main(tyro.cli(config, description=sys.modules[main.__module__].__doc__))
-    except (ValueError, OSError) as error:
+    except (ValueError, TypeError, OverflowError, OSError) as error:
         sys.exit(f"error: {error}")
 
 
@@ -87,7 +87,11 @@ def show(title: str, rows: list[tuple[str, str, str]]) -> None:
 
 def count_rows(counts: dict[str, int]) -> list[tuple[str, str, str]]:
     """Rows of what a reader dropped or mended; those of nothing are left to the report."""
-    return [(f"dropped or mended: {name.replace('_', ' ')}", str(count), "") for name, count in counts.items() if count]
+    return [
+        (f"dropped or mended in the log: {name.replace('_', ' ')}", str(count), "")
+        for name, count in counts.items()
+        if count
+    ]
 
 
 def saved(folder: Path, *names: str) -> None:

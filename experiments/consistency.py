@@ -46,6 +46,8 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     out = output_folder(config.out)
     if config.scenario not in simulate.SCENARIOS:
         raise ValueError(f"scenario: expected one of {sorted(simulate.SCENARIOS)}, got {config.scenario!r}")
+    if config.runs < 1:
+        raise ValueError(f"runs: expected at least 1, got {config.runs}")
     runs = min(config.runs, 100) if config.quick else config.runs
     devices = use_all_cores()
     scenario = simulate.SCENARIOS[config.scenario]

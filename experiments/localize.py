@@ -61,6 +61,8 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
         raise ValueError(f"{config.log}: expected landmarks to localise by, got none (format {config.format})")
     if config.start is None and not len(log.truth_time):
         raise ValueError(f"start: {config.log} has no truth to start from: expected a pose X Y THETA, got None")
+    if config.start is not None and not np.all(np.isfinite(config.start)):
+        raise ValueError(f"start: expected a finite pose X Y THETA, got {config.start}")
     begin = float(log.truth_time.min()) if config.start is None else None
     timeline = to_timeline(log, max_range=config.max_range, start=begin)
     if config.quick:

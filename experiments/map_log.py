@@ -22,6 +22,7 @@ from jaxlocmap.simulate import course_params
 
 _PIECE = 91  # scans between two moves of the progress bar
 _MARGIN = 1.0  # m around everything seen
+_MOST_CELLS = 20_000  # along one side: 1.6 GB of log-odds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +50,9 @@ class MapLogConfig:
 def main(config: MapLogConfig) -> dict[str, Any]:
     """Make the map, write it, the picture and the report."""
     out = output_folder(config.out)
+    for name, value in (("resolution", config.resolution), ("max_range", config.max_range)):
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name}: expected metres > 0, got {value}")
     log = read(config.log, config.format)
     if not len(log.scan_time) or not len(log.truth_time):
         raise ValueError(f"{config.log}: expected laser scans with poses, got {len(log.scan_time)} scans")
@@ -113,6 +117,10 @@ def _extent(log: Log, config: MapLogConfig) -> GridSpec:
     hit = np.isfinite(log.scan) & (log.scan < config.max_range)
     reach = np.where(hit, log.scan, 0.0)
     x, y = (log.truth[:, i : i + 1] + reach * f(angles) for i, f in ((0, np.cos), (1, np.sin)))
+    size = max(float(np.ptp(p)) for p in (x, y)) + 2 * _MARGIN
+    if size / config.resolution > _MOST_CELLS:
+        finest = size / _MOST_CELLS
+        raise ValueError(f"resolution: expected {finest:.2g} m or more for {size:.0f} m, got {config.resolution}")
     # Of stray returns far outside, one in a thousand may be cut off.
     low = [math.floor((np.quantile(p, 0.0005) - _MARGIN) / config.resolution) for p in (x, y)]
     high = [math.ceil((np.quantile(p, 0.9995) + _MARGIN) / config.resolution) for p in (x, y)]

@@ -14,12 +14,25 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, jax.core.Tracer)
 
 
-def shape(name: str, value: Any, expected: tuple[int | None, ...]) -> None:
-    """Raise unless `value` has the expected shape; None stands for any length.
+def number(name: str, value: Any) -> None:
+    """Raise unless `value` is one real number.
 
     Raises:
+        TypeError: it is something else.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{name}: expected a number, got {value!r}")
+
+
+def shape(name: str, value: Any, expected: tuple[int | None, ...]) -> None:
+    """Raise unless `value` is an array of the expected shape; None stands for any length.
+
+    Raises:
+        TypeError: not an array, nor a number where one is expected.
         ValueError: the shape differs.
     """
+    if not hasattr(value, "shape") and not isinstance(value, (int, float)):
+        raise TypeError(f"{name}: expected an array, got {type(value).__name__}")
     got = np.shape(value)
     if len(got) != len(expected) or any(e is not None and g != e for g, e in zip(got, expected, strict=True)):
         wanted = "(" + ", ".join("any" if e is None else str(e) for e in expected) + ")"

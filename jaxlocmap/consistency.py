@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
+from jaxlocmap.ekf import gate_threshold
 from jaxlocmap.linalg import Matrix, forward, ldl, mahalanobis
 from jaxlocmap.motion import wrap
 
@@ -75,9 +76,13 @@ def lag_one(white: jax.Array, observed: jax.Array) -> tuple[jax.Array, jax.Array
     return products.sum((0, 1)), squares.sum((0, 1)), paired.sum().astype(white.dtype)
 
 
-def chi2_quantile(probability: float, degrees: float) -> float:
-    """The value a χ² variable with `degrees` degrees of freedom stays below with `probability`."""
-    return float(2 * scipy.special.gammaincinv(degrees / 2, probability))
+def chi2_quantile(probability: float, degrees: int) -> float:
+    """The value a χ² variable with `degrees` degrees of freedom stays below with `probability`.
+
+    Raises:
+        ValueError: a probability outside (0, 1).
+    """
+    return gate_threshold(probability, degrees)
 
 
 def chi2_band(dimension: int, samples: int, probability: float = 0.95) -> tuple[float, float]:
@@ -147,9 +152,9 @@ def verdict(anees: float, band: tuple[float, float] | None = None, diverged: int
     ratio = (POSE_DIMENSION / anees if anees > 0 else math.inf) if small else anees / POSE_DIMENSION
     if band is not None and band[0] <= anees <= band[1]:
         opening = "not consistent" if diverged else "consistent"
-        return f"{opening}: ANEES {anees:.3g} lies in its 95 % band [{band[0]:.3g}, {band[1]:.3g}]{lost}"
-    where = "one run gives no band" if band is None else f"95 % band [{band[0]:.3g}, {band[1]:.3g}]"
-    judged = f"(ANEES {anees:.3g}, 3 expected, {where}){lost}"
+        return f"{opening}: ANEES {anees:.4g} lies in its 95 % band [{band[0]:.4g}, {band[1]:.4g}]{lost}"
+    where = "one run gives no band" if band is None else f"95 % band [{band[0]:.4g}, {band[1]:.4g}]"
+    judged = f"(ANEES {anees:.4g}, 3 expected, {where}){lost}"
     if band is None and ratio < _NEAR:
         return f"undecided: nothing speaks against the covariance {judged}"
     side, size = ("under-confident", "large") if small else ("over-confident", "small")

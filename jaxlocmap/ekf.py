@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import scipy.special
 
+from jaxlocmap import checks
 from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve
 from jaxlocmap.motion import MotionModel, wrap
 
@@ -63,7 +64,17 @@ def predict(
 
     Returns:
         mean (3,), cov (3, 3), symmetric to the last bit. Source: Thrun, Burgard & Fox 2005, section 7.4.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    for name, value, shape in (
+        ("mean", mean, (3,)),
+        ("cov", cov, (3, 3)),
+        ("control", control, (2,)),
+        ("Q", Q, (2, 2)),
+    ):
+        checks.shape(name, value, shape)
     F, G = (Matrix.of(J) for J in motion.jacobians(mean, control, dt))
     ratio = jnp.where(dt > 0, nominal_dt / jnp.where(dt > 0, dt, 1), 0)
     P = sandwich(F, Matrix.symmetric(cov)) + sandwich(G, Matrix.symmetric(Q).scale(ratio))
@@ -95,9 +106,15 @@ def update(
     Returns:
         An `Update`; innovation, S, nis and log-likelihood are there whether or not the gate let it in.
         Source: Bucy & Joseph 1968, section 16; Bar-Shalom, Li & Kirubarajan 2001, section 5.4 (the gate).
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shape("residual", residual, (None,))
+    m = len(residual)
+    for name, value, shape in (("mean", mean, (3,)), ("cov", cov, (3, 3)), ("H", H, (m, 3)), ("R", R, (m, m))):
+        checks.shape(name, value, shape)
     H, P, noise = Matrix.of(H), Matrix.symmetric(cov), Matrix.symmetric(R)
-    m = len(noise.rows)
     r = tuple(residual[i] for i in range(m))
     S = sandwich(H, P) + noise
     L, D = ldl(S)

@@ -11,7 +11,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxlocmap import checks
 from jaxlocmap.batching import any_in_batch, zero_like_any
 from jaxlocmap.types import GridSpec
 
@@ -65,7 +67,13 @@ def beam_cells(
 
     Returns:
         `Beams`; nothing is free or hit for a robot outside the map, nor beyond the edge.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shape("pose", pose, (3,))
+    checks.shape("beam_angles", beam_angles, (None,))
+    checks.shape("ranges", ranges, np.shape(beam_angles))
     rows, columns = spec.shape
     measured = jnp.isfinite(ranges) & (ranges > min_range)
     reach = jnp.where(measured, jnp.minimum(ranges, max_range), 0.0)
@@ -140,7 +148,13 @@ def update_log_odds(
 
     Returns:
         (rows, columns) nats. Source: Elfes 1989; Thrun, Burgard & Fox 2005, section 9.2.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shape("log_odds", log_odds, spec.shape)
+    checks.shape("pose", pose, (3,))
+    checks.shape("beam_angles", beam_angles, (None,))
     # Cells that are not touched get zero added, each somewhere else: one shared address would serialise the adds.
     beams, cells = len(beam_angles), _beam_length(spec, max_range)
     zero = zero_like_any(log_odds, pose, ranges, beam_angles, l_occ, l_free)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from jaxlocmap import checks
 from jaxlocmap.linalg import Matrix, mahalanobis, sandwich
 from jaxlocmap.motion import wrap
 
@@ -58,7 +59,12 @@ def linearise(
         residual: (2,) z minus `observe`, bearing wrapped. H: 2x3 `Matrix`, d observe / d pose.
         defined: () bool, False where the landmark lies on the sensor and has no bearing (H is then that of a
         landmark one metre away, so that gradients stay finite).
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    for name, value, shape in (("pose", pose, (3,)), ("landmark", landmark, (2,)), ("z", z, (2,))):
+        checks.shape(name, value, shape)
     x, y, heading, J = _sensor(pose, sensor_offset)
     dx, dy = landmark[0] - x, landmark[1] - y
     q = dx * dx + dy * dy
@@ -91,7 +97,15 @@ def associate(
     Returns:
         () int32 row of `landmarks`. Source: Thrun, Burgard & Fox 2005, section 7.5 (there with the maximum
         likelihood; the determinant of S differs little between landmarks, and the gate uses the distance).
+
+    Raises:
+        ValueError: a wrong shape, or no landmark.
     """
+    for name, value, shape in (("mean", mean, (3,)), ("cov", cov, (3, 3)), ("R", R, (2, 2))):
+        checks.shape(name, value, shape)
+    checks.shape("landmarks", landmarks, (None, 2))
+    if not len(landmarks):
+        raise ValueError("landmarks: expected at least one to choose from, got (0, 2)")
     P, noise = Matrix.symmetric(cov), Matrix.symmetric(R)
 
     def distance(landmark: jax.Array) -> jax.Array:

@@ -75,6 +75,11 @@ class Matrix:
         """The same matrix as an array of shape (n, m)."""
         return jnp.stack([jnp.stack([jnp.asarray(x, dtype) for x in row]) for row in self.rows])
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows, columns."""
+        return len(self.rows), len(self.rows[0])
+
     def __getitem__(self, index: tuple[int, int]) -> Scalar:
         return self.rows[index[0]][index[1]]
 

@@ -88,8 +88,12 @@ def load_map(path: str | Path) -> LoadedMap:
         ValueError: not such a YAML or PGM, a missing or impossible field, a mode other than trinary, or a rotated
             map; the message starts with the path.
         FileNotFoundError: no such file.
+        ImportError: PyYAML is not installed.
     """
-    import yaml  # needed here alone, so it is no dependency of the library
+    try:
+        import yaml  # needed here alone, so it is no dependency of the library
+    except ImportError as error:
+        raise ImportError("load_map needs PyYAML: pip install 'jaxlocmap[experiments]'") from error
 
     try:
         sheet = yaml.safe_load(Path(path).read_text())

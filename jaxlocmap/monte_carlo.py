@@ -63,15 +63,21 @@ def monte_carlo(
         progress: called with the number of runs done after each chunk.
 
     Returns:
-        `Result`. Sums are taken in the runs' own precision within a chunk and in float64 across chunks.
+        `Result`. Sums are taken in the runs' own precision (integers as floats) within a chunk and in float64 across
+        chunks.
 
     Raises:
-        ValueError: `runs` or `chunk` below 1.
+        ValueError: `runs` or `chunk` below 1, or no device.
+        TypeError: a key that is none.
     """
     for name, value in (("runs", runs), ("chunk", chunk)):
-        if value < 1:
-            raise ValueError(f"{name}: expected at least 1, got {value}")
+        if int(value) != value or value < 1:
+            raise ValueError(f"{name}: expected at least 1, a whole number, got {value}")
+    if not hasattr(key, "dtype"):
+        raise TypeError(f"key: expected one made by jax.random.key, got {key!r}")
     devices = tuple(jax.local_devices() if devices is None else devices)
+    if not devices:
+        raise ValueError("devices: expected at least one, got none")
     chunk = min(chunk, -(-runs // len(devices)))
     width = chunk * len(devices)
 
@@ -122,6 +128,7 @@ def _compiled(
 
         def total(x: jax.Array) -> jax.Array:
             weight = live.reshape(-1, *[1] * (x.ndim - 1))
+            x = x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
             return jax.lax.psum(jnp.sum(jnp.where(weight, x, jnp.zeros_like(x)), axis=0), "runs")
 
         return jax.tree.map(total, each)

@@ -121,7 +121,8 @@ def from_wheels(left: jax.Array, right: jax.Array, wheel_base: float, *, gyro: j
     Args:
         left, right: speed of each wheel over the ground, m/s, any shape.
         wheel_base: distance between the wheels, m, > 0.
-        gyro: measured yaw rate, rad/s; takes the place of the wheels' own, which slip spoils first.
+        gyro: measured yaw rate, rad/s, any shape that broadcasts; takes the place of the wheels' own, which slip
+            spoils first.
 
     Returns:
         (..., 2) v m/s, omega rad/s. Source: Siegwart, Nourbakhsh & Scaramuzza 2011, section 3.2.
@@ -131,7 +132,7 @@ def from_wheels(left: jax.Array, right: jax.Array, wheel_base: float, *, gyro: j
     """
     _require_base(wheel_base)
     omega = (right - left) / wheel_base if gyro is None else gyro
-    return jnp.stack([(right + left) / 2, omega], axis=-1)
+    return jnp.stack(jnp.broadcast_arrays((right + left) / 2, omega), axis=-1)
 
 
 def to_wheels(control: jax.Array, wheel_base: float) -> tuple[jax.Array, jax.Array]:

@@ -29,12 +29,16 @@ def init(prior: Gaussian, *, config: Config) -> State:
         config: `config.grid` None leaves out the map.
 
     Raises:
-        ValueError: wrong shapes, or a covariance that is not positive semi-definite (when it can be looked at).
+        ValueError: wrong shapes, or, when they can be looked at, a mean that is not finite or a covariance that is
+            not positive semi-definite.
         TypeError: a prior that is not floating point.
     """
     mean, cov = (jnp.asarray(x) for x in prior)
     checks.shape("prior.mean", mean, (3,))
-    checks.dtype("prior.mean", mean, np.floating)
+    for name, value in (("mean", mean), ("cov", cov)):
+        checks.dtype(f"prior.{name}", value, np.floating)
+    if checks.is_concrete(mean) and not np.all(np.isfinite(mean)):
+        raise ValueError(f"prior.mean: expected finite x, y, theta, got {mean.tolist()}")
     checks.covariance("prior.cov", cov, 3)
     return State(
         belief=Gaussian(mean, cov.astype(mean.dtype)),
@@ -61,14 +65,18 @@ def step(
         config: static.
 
     Returns:
-        The next state, and what the step reports. A control, step length or observation that is not finite (or a
-        negative step length) is left out and `Info.ok` is False; so it is when the covariance has broken down.
+        The next state, and what the step reports. `Info.ok` is False where a control is not finite (the robot is
+        then taken to stand still, its covariance growing by Q), a step length is not finite or negative (a nominal
+        step is taken, without the control), an observation is not finite or cannot be used (it is left out), or the
+        covariance has broken down.
 
     Raises:
-        ValueError: shapes that do not fit, an unknown motion model.
+        ValueError: shapes that do not fit, an unknown motion model, a grid in `config` but none in `state`.
         TypeError: landmark ids that are not integers, a `valid` that is not boolean.
     """
     _check_step(params, inputs, landmarks, beam_angles, config)
+    if config.grid is not None and state.log_odds is None:
+        raise ValueError("state.log_odds: expected a map, as init makes with this config, got None")
     dtype = state.belief.mean.dtype  # pinned in init: a carry must not change dtype
     params, inputs, landmarks, beam_angles = jax.tree.map(
         lambda x: jnp.asarray(x, dtype if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None),
@@ -122,8 +130,8 @@ def run(
         first and then the rest give the same numbers.
 
     Raises:
-        ValueError, TypeError: as `step`; also leading axes that differ, and Q or R not positive definite (when they
-            can be looked at).
+        ValueError, TypeError: as `step`; also leading axes that differ, and, when they can be looked at, a negative
+            step length, Q or R not positive definite, `l_occ` or `l_free` of the wrong sign.
     """
     _check_run(params, inputs)
 
@@ -157,12 +165,14 @@ def map_scans(
         (rows, columns) nats; the same as `run` makes at the same poses.
 
     Raises:
-        ValueError: no grid in `config`, or shapes that do not fit.
+        ValueError: no grid in `config`, shapes that do not fit, or parameters that `Params.check` refuses.
     """
+    params.check()
     checks.shape("poses", poses, (None, 3))
     checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
 
     zero = zero_like_any(params, log_odds, poses, ranges, beam_angles)
+    log_odds = jnp.asarray(log_odds)
     log_odds = log_odds + zero.astype(log_odds.dtype)
     params = Params(*(jnp.asarray(x, log_odds.dtype) for x in params))
 
@@ -173,19 +183,20 @@ def map_scans(
 
 
 def _predict(params: Params, belief: Gaussian, inputs: Inputs, config: Config) -> tuple[Gaussian, jax.Array]:
-    """The moved belief, and whether control and step length were usable. Where not, the robot is taken to stand
-    still for a nominal step: the belief still grows by Q.
+    """The moved belief, and whether control and step length were usable. Without a control the robot is taken to
+    stand still, with a belief that grows by Q all the same; without a step length, for a nominal step.
     """
-    usable = jnp.all(jnp.isfinite(inputs.control)) & jnp.isfinite(inputs.dt) & (inputs.dt >= 0)
+    steered = jnp.all(jnp.isfinite(inputs.control))
+    timed = jnp.isfinite(inputs.dt) & (inputs.dt >= 0)
     mean, cov = ekf.predict(
         *belief,
-        jnp.where(usable, inputs.control, 0),
-        jnp.where(usable, inputs.dt, config.dt),
+        jnp.where(steered & timed, inputs.control, 0),
+        jnp.where(timed, inputs.dt, config.dt),
         params.Q,
         motion=resolve(config.motion),
         nominal_dt=config.dt,
     )
-    return Gaussian(mean, cov), usable
+    return Gaussian(mean, cov), steered & timed
 
 
 class _Slots(NamedTuple):
@@ -305,3 +316,6 @@ def _check_run(params: Params, inputs: Inputs) -> None:
     for name, value in inputs._asdict().items():
         if value is not None and np.shape(value)[:1] != (steps,):
             raise ValueError(f"inputs.{name}: expected {steps} steps as inputs.dt has, got {np.shape(value)}")
+    if checks.is_concrete(inputs.dt) and np.any(np.asarray(inputs.dt) < 0):
+        k = int(np.argmax(np.asarray(inputs.dt) < 0))
+        raise ValueError(f"inputs.dt: expected seconds >= 0, got {np.asarray(inputs.dt)[k]} at step {k}")

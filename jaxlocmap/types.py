@@ -117,6 +117,7 @@ class GridSpec:
 
     Raises:
         ValueError: no cells, a resolution that is not positive, or bounds without 0 between them.
+        TypeError: a field that is no number, or no pair of them.
     """
 
     origin: tuple[float, float]  # m, world frame
@@ -126,8 +127,11 @@ class GridSpec:
     l_max: float = 4.0  # nats
 
     def __post_init__(self) -> None:
-        if len(self.shape) != 2 or min(self.shape) < 1:
-            raise ValueError(f"shape: expected (rows, columns), both at least 1, got {self.shape}")
+        _freeze_tuples(self, "origin", "shape")
+        for name in ("resolution", "l_min", "l_max"):
+            checks.number(name, getattr(self, name))
+        if len(self.shape) != 2 or min(self.shape) < 1 or any(int(n) != n for n in self.shape):
+            raise ValueError(f"shape: expected (rows, columns), whole numbers of at least 1, got {self.shape}")
         if not (math.isfinite(self.resolution) and self.resolution > 0):
             raise ValueError(f"resolution: expected metres per cell > 0, got {self.resolution}")
         if len(self.origin) != 2 or not all(math.isfinite(c) for c in self.origin):
@@ -141,7 +145,8 @@ class Config:
     """Settings that shape the program. Frozen and hashable, so static under jit.
 
     Raises:
-        ValueError: a field outside the range given beside it.
+        ValueError: a field outside the range given beside it; a motion model's name is looked up by `run`.
+        TypeError: a field that is no number, or an offset that is not three of them.
     """
 
     dt: float = 0.1  # s, > 0: the period that Q refers to
@@ -153,6 +158,11 @@ class Config:
     max_range: float = 8.0  # m: a range at or above clears cells up to here and marks none
 
     def __post_init__(self) -> None:
+        _freeze_tuples(self, "sensor_offset")
+        for name in ("dt", "min_range", "max_range"):
+            checks.number(name, getattr(self, name))
+        if self.gate_probability is not None:
+            checks.number("gate_probability", self.gate_probability)
         if not (math.isfinite(self.dt) and self.dt > 0):
             raise ValueError(f"dt: expected seconds > 0, got {self.dt}")
         if self.gate_probability is not None and not 0 < self.gate_probability < 1:
@@ -166,6 +176,17 @@ class Config:
             raise ValueError(
                 f"min_range, max_range: expected 0 <= min_range < max_range, got {self.min_range}, {self.max_range}"
             )
+
+
+def _freeze_tuples(record: Any, *names: str) -> None:
+    """Lists and arrays become tuples, so that the record can be hashed."""
+    for name in names:
+        value = getattr(record, name)
+        if not isinstance(value, (tuple, list, np.ndarray)):
+            raise TypeError(f"{name}: expected a tuple of numbers, got {value!r}")
+        for entry in value:
+            checks.number(name, entry)
+        object.__setattr__(record, name, tuple(value))
 
 
 class Inputs(NamedTuple):

@@ -181,6 +181,39 @@ def test_a_residual_that_is_no_number_never_passes_even_without_a_gate(bad):
     np.testing.assert_array_equal(update.mean, args[0])
 
 
+def test_an_innovation_covariance_that_is_not_definite_never_passes():
+    """R = -9 I makes S negative definite: a residual of zero then has a distance of zero, inside any gate."""
+    args = [jnp.array(x) for x in (MEAN, COV, np.zeros(2), np.eye(2, 3), -9 * np.eye(2))]
+    update = ekf.update(*args, threshold=9.21)
+    assert float(update.nis) == 0
+    assert not update.accepted
+    np.testing.assert_array_equal(update.mean, args[0])
+    np.testing.assert_array_equal(update.cov, args[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mean": np.zeros(4)}, r"mean: expected shape \(3\), got \(4,\)"),
+        ({"cov": np.eye(2)}, r"cov: expected shape \(3, 3\), got \(2, 2\)"),
+        ({"residual": np.zeros(3)}, r"H: expected shape \(3, 3\), got \(2, 3\)"),
+        ({"residual": np.zeros((2, 1))}, r"residual: expected shape \(any\), got \(2, 1\)"),
+        ({"H": np.eye(2)}, r"H: expected shape \(2, 3\), got \(2, 2\)"),
+        ({"R": np.eye(3)}, r"R: expected shape \(2, 2\), got \(3, 3\)"),
+    ],
+)
+def test_an_update_of_the_wrong_shape_is_refused_by_name(change, message):
+    whole = {"mean": MEAN, "cov": COV, "residual": np.zeros(2), "H": np.eye(2, 3), "R": R} | change
+    with pytest.raises(ValueError, match=message):
+        ekf.update(**{name: jnp.array(value) for name, value in whole.items()})
+
+
+def test_a_prediction_of_the_wrong_shape_is_refused_by_name():
+    arrays = [jnp.array(x) for x in (MEAN, COV, np.zeros(3))]
+    with pytest.raises(ValueError, match=r"control: expected shape \(2\), got \(3,\)"):
+        ekf.predict(*arrays, jnp.array(0.1), jnp.array(Q), motion=motion.EULER, nominal_dt=0.1)
+
+
 # --- course problem 2: a Joseph update of a positive semi-definite matrix is one
 
 joseph = jax.jit(lambda P, H, R: ekf.update(jnp.zeros(3), P, jnp.zeros(len(R)), H, R).cov)

@@ -160,6 +160,14 @@ def test_map_log_maps_a_real_building(tmp_path):
     assert is_png(tmp_path / "map.png")
 
 
+def test_a_resolution_too_fine_for_the_memory_is_refused(tmp_path):
+    intel = data("carmen", "intel-corrected.log.gz")
+    status, output = run("map_log", intel, "--format", "carmen", "--resolution", 0.0005, "--out", tmp_path)
+    assert status == 1
+    assert "resolution: expected" in output
+    assert "Traceback" not in output
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "expected"),
     [
@@ -173,6 +181,8 @@ def test_map_log_maps_a_real_building(tmp_path):
         ("localize", (".", "--format", "mrclam"), "robot: expected a robot's number"),
         ("localize", (".", "--format", "rosbag"), "rosbag"),
         ("map_log", ("nowhere.log", "--format", "carmen"), "nowhere.log"),
+        ("map_log", ("nowhere.log", "--format", "carmen", "--resolution", "0"), "resolution: expected metres > 0, got"),
+        ("map_log", ("nowhere.log", "--format", "carmen", "--resolution", "nan"), "resolution: expected metres > 0"),
     ],
 )
 def test_a_mistake_gets_one_clear_line(tmp_path, name, arguments, expected):

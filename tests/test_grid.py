@@ -409,3 +409,23 @@ def test_walls_turn_fuzzier_with_reach():
         for r in (1.0, 4.0, 8.0)
     ]
     assert wide[0] < wide[1] < wide[2]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"log_odds": (3, 3)}, r"log_odds: expected shape \(4, 4\), got \(3, 3\)"),
+        ({"pose": (4,)}, r"pose: expected shape \(3\), got \(4,\)"),
+        ({"ranges": (3,)}, r"ranges: expected shape \(2\), got \(3,\)"),
+        ({"beam_angles": (2, 1)}, r"beam_angles: expected shape \(any\), got \(2, 1\)"),
+    ],
+)
+def test_an_update_of_the_wrong_shape_is_refused_by_name(change, message):
+    """A map of another shape than the grid's would be written outside its bounds."""
+    shapes = {"log_odds": (4, 4), "pose": (3,), "ranges": (2,), "beam_angles": (2,)} | change
+    arrays = {name: jnp.ones(shape) for name, shape in shapes.items()}
+    spec = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(4, 4))
+    with pytest.raises(ValueError, match=message):
+        grid.update_log_odds(
+            **arrays, l_occ=jnp.array(0.8), l_free=jnp.array(-0.4), spec=spec, min_range=0.1, max_range=3.0
+        )

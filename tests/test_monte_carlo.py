@@ -103,10 +103,28 @@ def test_progress_counts_the_runs_done():
     assert done == [7, 14, 21, 23]
 
 
-@pytest.mark.parametrize(("name", "runs", "chunk"), [("runs", 0, 8), ("runs", -1, 8), ("chunk", 5, 0)])
+@pytest.mark.parametrize(
+    ("name", "runs", "chunk"), [("runs", 0, 8), ("runs", -1, 8), ("runs", 2.5, 8), ("chunk", 5, 0)]
+)
 def test_a_study_of_nothing_is_refused(name, runs, chunk):
-    with pytest.raises(ValueError, match=f"{name}: expected at least 1, got"):
+    with pytest.raises(ValueError, match=f"{name}: expected at least 1, a whole number, got"):
         monte_carlo(one_run, KEY, runs, *ARGS, chunk=chunk)
+
+
+def test_a_study_without_a_device_or_a_key_is_refused():
+    with pytest.raises(ValueError, match="devices: expected at least one"):
+        monte_carlo(one_run, KEY, 5, *ARGS, devices=())
+    with pytest.raises(TypeError, match=r"key: expected one made by jax\.random\.key, got 0"):
+        monte_carlo(one_run, 0, 5, *ARGS)
+
+
+def large_count(key):
+    del key
+    return jnp.array(2**30, jnp.int32)
+
+
+def test_counts_do_not_wrap_around():
+    assert monte_carlo(large_count, KEY, 10).value == 10 * 2.0**30
 
 
 # --- Compiling ---

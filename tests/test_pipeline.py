@@ -568,10 +568,45 @@ def test_a_covariance_that_has_broken_down_is_flagged(short, config):
     assert not jnp.any(info.ok)
 
 
-def test_a_prior_that_is_no_number_is_flagged_where_it_cannot_raise(short, config):
-    bad = jnp.array([jnp.nan, 1.0, 0.0])
-    _, info = localise(short._replace(prior=short.prior._replace(mean=bad)), config)
+def test_a_prior_that_is_no_number_is_refused_or_where_it_cannot_be_flagged(short, config):
+    bad = short.prior._replace(mean=jnp.array([jnp.nan, 1.0, 0.0]))
+    with pytest.raises(ValueError, match=r"prior\.mean: expected finite x, y, theta, got \[nan"):
+        init(bad, config=config)
+    _, info = compiled(
+        short.params,
+        init(short.prior, config=config)._replace(belief=bad),
+        short.inputs,
+        landmarks=short.landmarks,
+        config=config,
+    )
     assert not jnp.any(info.ok)
+
+
+def test_a_negative_step_length_is_refused_where_it_can_be_looked_at(short, config):
+    inputs = short.inputs._replace(dt=short.inputs.dt.at[2].set(-0.1))
+    with pytest.raises(ValueError, match=r"inputs\.dt: expected seconds >= 0, got -0\.1 at step 2"):
+        run(short.params, init(short.prior, config=config), inputs, landmarks=short.landmarks, config=config)
+
+
+def test_a_control_that_is_no_number_takes_its_time_all_the_same(short, config):
+    """Two seconds of unknown motion add the noise of two seconds at rest, and none pass at dt = 0."""
+    dt = short.inputs.dt.at[1].set(2.0).at[2].set(0.0)
+    lost = short.inputs.control.at[1:3].set(jnp.nan)
+    rest = short.inputs.control.at[1:3].set(0.0)
+    blind = jnp.zeros_like(short.inputs.valid)
+    _, got = localise(edit(short, dt=dt, control=lost, valid=blind), config)
+    _, expected = localise(edit(short, dt=dt, control=rest, valid=blind), config)
+    chex.assert_trees_all_equal(got.belief, expected.belief)
+    assert got.ok.tolist() == [True, False, False] + [True] * (STEPS - 3)
+
+
+def test_a_state_without_a_map_is_refused_by_a_config_with_a_grid(course, short, config):
+    with pytest.raises(ValueError, match=r"state\.log_odds: expected a map"):
+        localise(
+            short,
+            course.config(mapping=True),
+            lambda params, state, *rest, **more: run(params, init(short.prior, config=config), *rest, **more),
+        )
 
 
 # --- gradients

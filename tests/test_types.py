@@ -124,7 +124,7 @@ GRID = {"origin": (0.0, 0.0), "resolution": 0.1, "shape": (3, 4)}
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"shape": (0, 4)}, r"shape: expected \(rows, columns\), both at least 1, got \(0, 4\)"),
+        ({"shape": (0, 4)}, r"shape: expected \(rows, columns\), whole numbers of at least 1, got \(0, 4\)"),
         ({"shape": (3, -1)}, r"shape: expected .* got \(3, -1\)"),
         ({"shape": (3,)}, r"shape: expected .* got \(3,\)"),
         ({"shape": (3, 4, 5)}, r"shape: expected .* got \(3, 4, 5\)"),
@@ -201,3 +201,32 @@ def test_an_expected_shape_says_where_any_length_will_do():
 def test_dtype_checks_see_through_jit():
     with pytest.raises(TypeError, match=r"landmark: expected dtype integer, got float32"):
         jax.jit(lambda x: checks.dtype("landmark", x, np.integer))(np.zeros(2, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("record", "change", "message"),
+    [
+        (GridSpec, {"resolution": "0.1"}, r"resolution: expected a number, got '0\.1'"),
+        (GridSpec, {"shape": 5}, "shape: expected a tuple of numbers, got 5"),
+        (GridSpec, {"origin": ("0", 1.0)}, "origin: expected a number, got '0'"),
+        (Config, {"dt": None}, "dt: expected a number, got None"),
+        (Config, {"gate_probability": "0.99"}, r"gate_probability: expected a number, got '0\.99'"),
+        (Config, {"sensor_offset": 0.2}, r"sensor_offset: expected a tuple of numbers, got 0\.2"),
+    ],
+)
+def test_a_setting_that_is_no_number_is_named(record, change, message):
+    whole = {"origin": (0.0, 0.0), "resolution": 1.0, "shape": (2, 3)} if record is GridSpec else {}
+    with pytest.raises(TypeError, match=message):
+        record(**whole | change)
+
+
+def test_settings_given_as_lists_can_be_hashed():
+    grid = GridSpec(origin=[0.0, 1.0], resolution=1.0, shape=[2, 3])
+    assert hash(Config(grid=grid, sensor_offset=[0.0, 0.0, 0.1])) == hash(
+        Config(grid=GridSpec((0.0, 1.0), 1.0, (2, 3)), sensor_offset=(0.0, 0.0, 0.1))
+    )
+
+
+def test_params_made_of_lists_are_refused_by_name():
+    with pytest.raises(TypeError, match="Q: expected an array, got list"):
+        Params([[1.0, 0.0], [0.0, 1.0]], jnp.eye(2), jnp.array(1.0), jnp.array(-1.0)).check()
