@@ -318,4 +318,4 @@ def _check_run(params: Params, inputs: Inputs) -> None:
             raise ValueError(f"inputs.{name}: expected {steps} steps as inputs.dt has, got {np.shape(value)}")
     if checks.is_concrete(inputs.dt) and np.any(np.asarray(inputs.dt) < 0):
         k = int(np.argmax(np.asarray(inputs.dt) < 0))
-        raise ValueError(f"inputs.dt: expected seconds >= 0, got {np.asarray(inputs.dt)[k]} at step {k}")
+        raise ValueError(f"inputs.dt: expected seconds >= 0, got {float(inputs.dt[k]):g} at step {k}")
