@@ -239,9 +239,9 @@ def _print(report: dict[str, Any], judged: bool) -> None:
         rows += [
             ("position RMSE", f"{report['rmse_position_m']:.3f} m", ""),
             ("yaw RMSE", f"{report['rmse_yaw_rad']:.3f} rad", ""),
-            ("ANEES (3 degrees)", f"{report['anees']:.3g}", "3"),
-            ("ANEES at sightings", f"{report['anees_at_sightings'] or float('nan'):.3g}", "3"),
-            ("median NEES", f"{report['nees_median']:.3g}", f"{consistency.chi2_quantile(0.5, 3):.2f}"),
+            ("ANEES (3 degrees)", consistency.readable(report["anees"]), "3"),
+            ("ANEES at sightings", consistency.readable(report["anees_at_sightings"] or float("nan")), "3"),
+            ("median NEES", consistency.readable(report["nees_median"]), f"{consistency.chi2_quantile(0.5, 3):.2f}"),
             ("95 % ellipsoid holds", f"{100 * report['coverage_95']:.1f} %", "95 %"),
             ("steps with truth", f"{100 * report['truth_share']:.1f} %", ""),
         ]

@@ -11,6 +11,7 @@ import localize
 from common import CONSOLE, command_line, output_folder
 
 from jaxlocmap import Params, simulate
+from jaxlocmap.consistency import readable
 
 _README = Path(__file__).parent.parent / "README.md"
 _STUDIES: tuple[tuple[str, str, dict[str, Any]], ...] = (
@@ -123,7 +124,7 @@ def _logs(config: TablesConfig, data: Path, out: Path) -> str:
 
 def _log_row(what: str, reports: list[dict[str, Any]]) -> str:
     rmse = ", ".join(f"{report['rmse_position_m']:.3f}" for report in reports)
-    anees = ", ".join(f"{report['anees']:.3g}" for report in reports)
+    anees = ", ".join(readable(report["anees"]) for report in reports)
     gate = ", ".join(f"{100 * report['gate_accept_rate']:.1f}" for report in reports)
     if len(reports) == 1:
         says = f"{_short(reports[0]['verdict'])}; {reports[0]['gate_verdict'].split(';')[0]}"

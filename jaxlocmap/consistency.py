@@ -135,6 +135,11 @@ def mean_over_runs(total: float, total_square: float, runs: int, expected: float
     return Mean(value, error, (expected - reach, expected + reach))
 
 
+def readable(value: float, digits: int = 3) -> str:
+    """A number for people: so many digits, and never a power of ten where there is room for the number."""
+    return f"{value:,.0f}" if 10**digits <= abs(value) < 1e9 else f"{value:.{digits}g}"
+
+
 def verdict(anees: float, band: tuple[float, float] | None = None, diverged: int = 0, runs: int = 1) -> str:
     """What the average NEES of a pose says about its covariance, with the size of the misfit.
 
@@ -152,13 +157,13 @@ def verdict(anees: float, band: tuple[float, float] | None = None, diverged: int
     ratio = (POSE_DIMENSION / anees if anees > 0 else math.inf) if small else anees / POSE_DIMENSION
     if band is not None and band[0] <= anees <= band[1]:
         opening = "not consistent" if diverged else "consistent"
-        return f"{opening}: ANEES {anees:.4g} lies in its 95 % band [{band[0]:.4g}, {band[1]:.4g}]{lost}"
+        return f"{opening}: ANEES {readable(anees, 4)} lies in its 95 % band [{band[0]:.4g}, {band[1]:.4g}]{lost}"
     where = "one run gives no band" if band is None else f"95 % band [{band[0]:.4g}, {band[1]:.4g}]"
-    judged = f"(ANEES {anees:.4g}, 3 expected, {where}){lost}"
+    judged = f"(ANEES {readable(anees, 4)}, 3 expected, {where}){lost}"
     if band is None and ratio < _NEAR:
         return f"undecided: nothing speaks against the covariance {judged}"
     side, size = ("under-confident", "large") if small else ("over-confident", "small")
-    return f"{side}: covariance {ratio:.3g} times too {size} {judged}"
+    return f"{side}: covariance {readable(ratio)} times too {size} {judged}"
 
 
 def gate_verdict(accept_rate: float, nominal: float | None, observations: int | None = None) -> str:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from jaxlocmap.consistency import COVERAGE_LEVELS, chi2_quantile
+from jaxlocmap.consistency import COVERAGE_LEVELS, chi2_quantile, readable
 from jaxlocmap.types import GridSpec
 
 _TRUTH, _ESTIMATE, _BAND, _EXPECTED = "0.25", "tab:blue", "tab:green", "tab:orange"
@@ -69,10 +69,11 @@ def log_nees_figure(path: Path, time: np.ndarray, nees: np.ndarray, report: dict
     low, high = (chi2_quantile(p, 3) for p in (0.025, 0.975))
     left.axhspan(low, high, color=_BAND, alpha=0.25, label="95 % of an honest filter's values, χ²(3)")
     left.plot(time - time[0], nees, color=_ESTIMATE, lw=0.6, label="NEES")
-    left.axhline(report["anees"], color=_EXPECTED, ls="--", label=f"ANEES {report['anees']:.3g}")
-    left.set(title=report["verdict"], xlabel="time [s]", ylabel="NEES [–]", yscale="log")
+    left.axhline(report["anees"], color=_EXPECTED, ls="--", label=f"ANEES {readable(report['anees'])}")
+    left.set(title="NEES of the pose", xlabel="time [s]", ylabel="NEES [–]", yscale="log")
     left.legend(fontsize=8)
     _coverage_bars(right, [report[f"coverage_{round(100 * level)}"] for level in COVERAGE_LEVELS])
+    figure.suptitle(f"{report['log']} — {report['verdict']}", fontsize=11)
     figure.savefig(path, dpi=120)
 
 

@@ -234,6 +234,11 @@ def test_a_chi2_band_over_runs_times_steps_does_not_hold_it():
             (2.9, 3.1),
             "under-confident: covariance inf times too large (ANEES 0, 3 expected, 95 % band [2.9, 3.1])",
         ),
+        (
+            10138.2,
+            None,
+            "over-confident: covariance 3,379 times too small (ANEES 10,138, 3 expected, one run gives no band)",
+        ),
         (math.nan, (2.9, 3.1), "not consistent: the NEES is not finite"),
         (math.inf, None, "not consistent: the NEES is not finite"),
     ],
