@@ -63,7 +63,7 @@ def predict(
         Q: (2, 2) covariance of the control over `nominal_dt` seconds.
 
     Returns:
-        mean (3,), cov (3, 3), symmetric to the last bit. Source: Thrun, Burgard & Fox 2005, section 7.4.
+        mean (3,), cov (3, 3), symmetric. Source: Thrun, Burgard & Fox 2005, section 7.4.
 
     Raises:
         ValueError: a wrong shape.

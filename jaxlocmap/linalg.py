@@ -104,7 +104,11 @@ class Matrix:
 
 
 def sandwich(A: Matrix, P: Matrix) -> Matrix:
-    """A P Aᵀ for symmetric P: the upper triangle is computed, the lower mirrors it, so symmetry is exact."""
+    """A P Aᵀ for symmetric P: the upper triangle is computed, the lower mirrors it.
+
+    A compiler that evaluates a mirrored entry twice may round the copies apart. That does not feed back: the filter
+    reads the upper triangle of a covariance alone, through `Matrix.symmetric`.
+    """
     AP = A @ P
     n = len(A.rows)
     upper = {(i, j): _dot(AP.rows[i], A.rows[j]) for i in range(n) for j in range(i, n)}

@@ -244,20 +244,21 @@ def test_a_run_split_in_two_is_the_whole(course):
     chex.assert_trees_all_equal(jax.tree.map(lambda *x: jnp.concatenate(x), *infos), info)
 
 
-def test_mapping_afterwards_is_mapping_on_the_way(course):
+def test_mapping_afterwards_is_mapping_on_the_way(course, tolerance):
     on_the_way, info = localise(course, course.config(mapping=True))
     alone, without = localise(edit(course, ranges=None), course.config())
-    chex.assert_trees_all_equal(info.belief, without.belief)
+    # Two programs, which the compiler may round differently.
+    chex.assert_trees_all_close(info.belief, without.belief, rtol=0, atol=tolerance(1e-12, 1e-4))
     assert alone.log_odds is None
     afterwards = jax.jit(map_scans, static_argnames="config")(
         course.params,
         jnp.zeros(course.grid.shape),
-        without.belief.mean,
+        info.belief.mean,
         course.inputs.ranges,
         beam_angles=course.beam_angles,
         config=course.config(mapping=True),
     )
-    np.testing.assert_array_equal(afterwards, on_the_way.log_odds)
+    np.testing.assert_allclose(afterwards, on_the_way.log_odds, rtol=0, atol=tolerance(1e-12, 1e-4))
 
 
 def test_a_run_is_a_loop_of_steps(short, config, short_result, tolerance):
