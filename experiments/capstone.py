@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from common import CONSOLE, command_line, output_folder, saved, show, write_report
 
-from jaxlocmap import Inputs, consistency, grid, init, plotting, run, simulate
+from jaxlocmap import consistency, grid, init, plotting, run, simulate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +53,7 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
         state, info = run(
             simulate.course_params(),
             init(prior, config=settings),
-            Inputs(*inputs),
+            inputs,
             landmarks=world.landmarks,
             beam_angles=scenario.beam_angles(),
             config=settings,

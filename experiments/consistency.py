@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from common import CONSOLE, command_line, output_folder, params_or, progress_bar, saved, show, write_report
 
@@ -99,7 +98,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
 def _picture_of_one_run(path: Path, key: jax.Array, params: Params, scenario: simulate.Scenario, settings: Any) -> None:
     """The map and path of one more run of the same study, started at the prior's mean."""
     world, prior = simulate.room(), scenario.prior()
-    truth, inputs = simulate.simulate(key, world, simulate.Noise(), jnp.asarray(prior.mean), scenario=scenario)
+    truth, inputs = simulate.simulate(key, world, simulate.Noise(), prior.mean, scenario=scenario)
     state, beliefs = jax.jit(run, static_argnames=("config", "collect"))(
         params,
         init(prior, config=settings),

@@ -140,7 +140,7 @@ def _judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str
         "observations": observations,
         "gate_accept_rate": rate,
         "gate_nominal_rate": config.gate_probability,
-        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability),
+        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability, observations),
         "longest_rejection": _longest_rejection(np.asarray(valid), np.asarray(info.accepted)),
         "nis_mean": float(info.nis[valid].mean()) if observations else None,
         "innovation_lag_one": _whiteness(log, timeline, info),

@@ -89,13 +89,14 @@ def monte_carlo(
     compile_s = seconds if _compiled.cache_info().misses > before else 0.0
 
     began = time.perf_counter()
-    parts = []
+    parts: list[Any] = []
     for start in range(0, runs, width):
         index = np.arange(start, start + width, dtype=np.int32)
         part = jax.tree.map(np.asarray, program(index, np.int32(runs), key, args))
-        parts.append(part)
-        if not keep_runs:
-            parts = [functools.reduce(lambda a, b: jax.tree.map(_add, a, b), parts)]
+        if keep_runs or not parts:
+            parts.append(part)
+        else:
+            parts[0] = jax.tree.map(_add, parts[0], part)
         if progress is not None:
             progress(min(start + width, runs))
     if keep_runs:

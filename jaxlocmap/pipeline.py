@@ -260,7 +260,6 @@ def _update_map(
 ) -> jax.Array:
     if config.grid is None:
         raise ValueError("config.grid: expected the GridSpec that the map was made for, got None")
-    checks.shape("log_odds", log_odds, config.grid.shape)
     return grid.update_log_odds(
         log_odds,
         pose,
