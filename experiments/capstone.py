@@ -31,14 +31,13 @@ def course_draws(seed: int, scenario: simulate.Scenario, landmarks: int) -> simu
     rate, range and bearing of each landmark when the detector looks, then the beams.
     """
     generator = np.random.RandomState(seed)
-    heading, control, sighting, scan = [], [], [], []
+    drive, sighting, scan = [], [], []
     for k in range(scenario.steps):
-        heading.append(generator.standard_normal())
-        control.append(generator.standard_normal(2))
-        if k % scenario.sight_period == 0:
-            sighting.append(generator.standard_normal((landmarks, 2)))
+        drive.append(generator.standard_normal(3))
+        looks = k % scenario.sight_period == 0
+        sighting.append(generator.standard_normal((landmarks, 2)) if looks else np.zeros((landmarks, 2)))
         scan.append(generator.standard_normal(scenario.beams))
-    return simulate.Draws(*(jnp.asarray(np.array(numbers)) for numbers in (heading, control, sighting, scan)))
+    return simulate.Draws(*(jnp.asarray(np.array(numbers)) for numbers in (drive, sighting, scan)))
 
 
 def main(config: CapstoneConfig) -> dict[str, Any]:

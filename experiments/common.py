@@ -2,23 +2,52 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
+import os
+import shlex
+import signal
 import sys
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+import jax
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxlocmap import Params
+from jaxlocmap import Params, hosts
+from jaxlocmap.monte_carlo import Result, monte_carlo
+from jaxlocmap.parts import Parts
 
+_README = Path(__file__).parent.parent / "README.md"
 CONSOLE = Console(width=min(100, Console().width) if sys.stdout.isatty() else 100)
+
+
+@dataclasses.dataclass(frozen=True)
+class ComputeConfig:
+    """Where and how it is computed; the results do not depend on it, but for rounding."""
+
+    chunk: int | None = None
+    """Runs that one device computes at once; chosen by default, so that they stay in its cache."""
+    devices: int | None = None
+    """How many of this machine's processor cores (or accelerators, where there are any) to use; all by default."""
+    resume: bool = False
+    """Go on with the study that was stopped in the folder --out."""
+    distributed: bool = False
+    """Share the work with other processes; a job of Slurm, Kubernetes or Open MPI needs no more than this."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0, where there is no such job; then also --processes and --process-id."""
+    processes: int | None = None
+    """How many processes share the work."""
+    process_id: int | None = None
+    """Which of them this one is, from 0."""
 
 
 def command_line(main: Callable[[Any], Any], config: type) -> None:
@@ -26,7 +55,90 @@ def command_line(main: Callable[[Any], Any], config: type) -> None:
     try:
         main(tyro.cli(config, description=sys.modules[main.__module__].__doc__))
     except (ValueError, TypeError, OverflowError, OSError) as error:
-        sys.exit(f"error: {error}")
+        _leave(1, f"error: {error}")
+    except KeyboardInterrupt as stop:
+        kept = "".join(map(str, stop.args))
+        again = shlex.join([*sys.orig_argv, *([] if "--resume" in sys.argv else ["--resume"])])
+        _leave(130, f"stopped; {kept}; go on with\n{again}" if kept else "stopped")
+
+
+def _leave(status: int, last_words: str) -> NoReturn:
+    print(last_words, file=sys.stderr, flush=True)
+    if jax.distributed.is_initialized() or threading.active_count() > 1:
+        os._exit(status)  # JAX would wait minutes for the other processes, or crash under a thread that does
+    sys.exit(status)
+
+
+def start(config: ComputeConfig) -> None:
+    """Set up JAX's devices and processes, before anything else touches it. Only process 0 speaks from here on.
+
+    Raises:
+        ValueError, OSError: as `hosts.join` and `hosts.use_all_cores`.
+    """
+    hosts.merge_kernels()
+    given = (config.coordinator, config.processes, config.process_id)
+    if config.distributed or given != (None, None, None):
+        hosts.join(*given)
+    devices = hosts.use_all_cores(config.devices)
+    CONSOLE.quiet = jax.process_index() > 0
+    platform = jax.devices()[0].platform
+    others = f" in each of {jax.process_count()} processes" if jax.process_count() > 1 else ""
+    CONSOLE.print(f"computing on {devices} {platform} device(s){others}; compiling takes some seconds")
+
+
+def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -> Parts:
+    """Where in the output folder a study with these settings keeps its finished parts."""
+    return Parts(
+        out / "parts",
+        settings,
+        resume=config.resume,
+        say=lambda sentence: CONSOLE.print(sentence, highlight=False, soft_wrap=True),
+    )
+
+
+def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeConfig, parts: Parts) -> Result:
+    """`monte_carlo` under a bar. Ctrl-C stops it after the turn under way, a second Ctrl-C at once.
+
+    Raises:
+        KeyboardInterrupt: it was stopped; says what is kept, if anything.
+    """
+    try:
+        with progress_bar("simulating", runs) as bar, _stopped_by_ctrl_c(bar) as progress:
+            devices = jax.local_devices()[: config.devices]
+            return monte_carlo(
+                one_run, key, runs, *args, chunk=config.chunk, devices=devices, progress=progress, parts=parts
+            )
+    except KeyboardInterrupt:
+        kept = [f"{parts.runs_kept:,} of {runs:,} runs are kept in {parts.folder}"] if parts.runs_kept else []
+        raise KeyboardInterrupt(*kept) from None
+
+
+def finish(parts: Parts) -> None:
+    """Clear the parts of a study whose report is written, by whichever process."""
+    hosts.gather(np.zeros((), np.int32))  # until then nobody goes on
+    parts.clear()
+
+
+@contextmanager
+def _stopped_by_ctrl_c(progress: Callable[[int], None]) -> Iterator[Callable[[int], None]]:
+    stop = False
+
+    def on_ctrl_c(*_: Any) -> None:
+        nonlocal stop
+        stop = True
+        signal.signal(signal.SIGINT, before)
+        CONSOLE.print("stopping after this turn; Ctrl-C again stops at once")
+
+    def move(done: int) -> None:
+        progress(done)
+        if stop:
+            raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, on_ctrl_c)
+    try:
+        yield move
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def output_folder(path: Path) -> Path:
@@ -97,3 +209,12 @@ def count_rows(counts: dict[str, int]) -> list[tuple[str, str, str]]:
 def saved(folder: Path, *names: str) -> None:
     """Say what was written, and where."""
     CONSOLE.print(f"wrote {', '.join(names)} to {folder}", soft_wrap=True)
+
+
+def replace_table(name: str, table: str) -> None:
+    begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->"
+    head, found, rest = _README.read_text().partition(begin)
+    _, ended, tail = rest.partition(end)
+    if not (found and ended):
+        raise ValueError(f"{_README}: expected the marks {begin.strip()} and {end}")
+    _README.write_text(head + begin + table + "\n" + end + tail)

@@ -5,14 +5,27 @@ from __future__ import annotations
 import dataclasses
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import numpy as np
-from common import CONSOLE, command_line, output_folder, params_or, progress_bar, saved, show, write_report
+import tyro
+from common import (
+    CONSOLE,
+    ComputeConfig,
+    command_line,
+    finish,
+    output_folder,
+    params_or,
+    saved,
+    show,
+    start,
+    study,
+    study_parts,
+    write_report,
+)
 
 from jaxlocmap import Params, init, plotting, run, simulate
-from jaxlocmap.monte_carlo import monte_carlo, use_all_cores
 from jaxlocmap.study import Study, summarise
 
 
@@ -38,6 +51,7 @@ class ConsistencyConfig:
     """Folder for report.json, nees.png and map.png."""
     quick: bool = False
     """A run of a few seconds: 100 runs."""
+    compute: Annotated[ComputeConfig, tyro.conf.arg(name="")] = dataclasses.field(default_factory=ComputeConfig)
 
 
 def main(config: ConsistencyConfig) -> dict[str, Any]:
@@ -48,50 +62,45 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     if config.runs < 1:
         raise ValueError(f"runs: expected at least 1, got {config.runs}")
     runs = min(config.runs, 100) if config.quick else config.runs
-    devices = use_all_cores()
+    start(config.compute)
     scenario = simulate.SCENARIOS[config.scenario]
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=config.map)
     params = params_or(config.params, simulate.course_params())
     world, noise, prior = simulate.room(), simulate.Noise(), scenario.prior()
     key = jax.random.key(config.seed)
-    CONSOLE.print(
-        f"{runs} runs of {scenario.name}, {scenario.steps} steps each, on {devices} {jax.devices()[0].platform} "
-        f"device(s); compiling takes some seconds"
-    )
+    named = {name: getattr(config, name) for name in ("scenario", "motion", "gate", "map", "seed")}
+    parts = study_parts(out, config.compute, named)
+    CONSOLE.print(f"{runs} runs of {scenario.name}, {scenario.steps} steps each")
 
     began = time.perf_counter()
-    with progress_bar("simulating", runs) as progress:
-        result = monte_carlo(
-            Study(scenario, settings),
-            key,
-            runs,
-            params,
-            world,
-            noise,
-            prior,
-            chunk=64 if config.map else 512,
-            progress=progress,
-        )
+    totals = study(
+        Study(scenario, settings), key, runs, params, world, noise, prior, config=config.compute, parts=parts
+    )
     report = {
         "scenario": scenario.name,
         "motion": config.motion,
         "prior": "exact" if scenario.exact_prior else "drawn",
-        **summarise(result.value, settings),
+        **summarise(totals.value, settings),
         "params": {name: np.asarray(value).tolist() for name, value in params._asdict().items()},
         "seed": config.seed,
-        "devices": devices,
+        "chunk": totals.chunk,
+        "devices": totals.devices,
+        "processes": totals.processes,
+        "resumed_runs": totals.resumed_runs,
         "wall_s": time.perf_counter() - began,
-        "compile_s": result.compile_s,
-        "runs_per_s": runs / result.run_s,
+        "compile_s": totals.compile_s,
+        "runs_per_s": (runs - totals.resumed_runs) / totals.run_s,
     }
-    write_report(out, report)
-    plotting.study_figure(out / "nees.png", report, scenario.dt)
-    files = ["report.json", "nees.png"]
-    if config.map:
-        _picture_of_one_run(out / "map.png", key, params, scenario, settings)
-        files.append("map.png")
-    _print(report)
-    saved(out, *files)
+    if jax.process_index() == 0:
+        write_report(out, report)
+        plotting.study_figure(out / "nees.png", report, scenario.dt)
+        files = ["report.json", "nees.png"]
+        if config.map:
+            _picture_of_one_run(out / "map.png", key, params, scenario, settings)
+            files.append("map.png")
+        _print(report)
+        saved(out, *files)
+    finish(parts)
     return report
 
 
@@ -173,7 +182,9 @@ def _print(report: dict[str, Any]) -> None:
             highlight=False,
         )
     CONSOLE.print(
-        f"{report['runs_per_s']:.0f} runs/s after {report['compile_s']:.1f} s of compilation", highlight=False
+        f"{report['runs_per_s']:.0f} runs/s after {report['compile_s']:.1f} s of compilation, in chunks of "
+        f"{report['chunk']} runs on {report['devices']} device(s) of {report['processes']} process(es)",
+        highlight=False,
     )
 
 

@@ -14,6 +14,7 @@ import tyro
 from common import CONSOLE, command_line, count_rows, output_folder, params_or, progress_bar, saved, show, write_report
 
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, consistency, init, plotting, run
+from jaxlocmap.hosts import merge_kernels
 from jaxlocmap.logs import Log, Timeline, read, to_timeline, write_tum
 
 _PIECE = 2000  # steps between two moves of the progress bar
@@ -56,6 +57,7 @@ class LocalizeConfig:
 def main(config: LocalizeConfig) -> dict[str, Any]:
     """Run the filter over the log, write the report, the figures and the trajectories."""
     out = output_folder(config.out)
+    merge_kernels()
     log = read(config.log, config.format, config.robot)
     if not len(log.landmarks):
         raise ValueError(f"{config.log}: expected landmarks to localise by, got none (format {config.format})")

@@ -8,12 +8,11 @@ from typing import Any
 
 import consistency
 import localize
-from common import CONSOLE, command_line, output_folder
+from common import CONSOLE, command_line, output_folder, replace_table
 
-from jaxlocmap import Params, simulate
+from jaxlocmap import simulate
 from jaxlocmap.consistency import readable
 
-_README = Path(__file__).parent.parent / "README.md"
 _STUDIES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("the course's noise, exact arc (the default)", "", {}),
     ("the course's noise, exact mean, first-order Jacobians", "--motion capstone", {"motion": "capstone"}),
@@ -63,7 +62,7 @@ def main(config: TablesConfig) -> dict[str, str]:
         tables["logs"] = _logs(config, config.data, out)
     for name, table in tables.items():
         if config.write:
-            _replace(name, table)
+            replace_table(name, table)
         else:
             CONSOLE.print(f"\n{table}", markup=False, highlight=False, soft_wrap=True)
     return tables
@@ -71,10 +70,7 @@ def main(config: TablesConfig) -> dict[str, str]:
 
 def _studies(config: TablesConfig, out: Path) -> str:
     plant = out / "plant.json"
-    noise = simulate.Noise()
-    # Heading noise of a step is what a yaw rate's would be that acts for its length.
-    w = (float(noise.w) ** 2 + (float(noise.heading) / simulate.CAPSTONE.dt) ** 2) ** 0.5
-    Params.from_std(v=float(noise.v), w=w, range=float(noise.range), bearing=float(noise.bearing)).save(plant)
+    simulate.own_params(simulate.Noise(), simulate.CAPSTONE.dt).save(plant)
     rows = ["| the filter believes | arguments | ANEES (3) | x, y, yaw alone (1) | NIS (2) | gate lets in | verdict |"]
     rows.append("|---" * 7 + "|")
     for i, (what, arguments, settings) in enumerate(_STUDIES):
@@ -137,15 +133,6 @@ def _short(verdict: str) -> str:
     """The verdict without the numbers that stand in the table's other columns."""
     head, _, tail = verdict.partition(" (")
     return head + (";" + tail.partition(");")[2] if ");" in tail else "")
-
-
-def _replace(name: str, table: str) -> None:
-    begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->"
-    head, found, rest = _README.read_text().partition(begin)
-    _, ended, tail = rest.partition(end)
-    if not (found and ended):
-        raise ValueError(f"{_README}: expected the marks {begin.strip()} and {end}")
-    _README.write_text(head + begin + table + "\n" + end + tail)
 
 
 if __name__ == "__main__":

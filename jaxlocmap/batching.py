@@ -1,12 +1,18 @@
-"""Branches that stay branches under `vmap`, and constants that fit beside values under `shard_map`."""
+"""Loops and branches that run well under `vmap`, and constants that fit beside values under `shard_map`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
+
+from jaxlocmap.linalg import stack
+
+_SMALL = 9  # entries: up to here an array is taken apart, such as the covariance of a pose
 
 
 @custom_vmap
@@ -38,3 +44,98 @@ def zero_like_any(*trees: Any) -> jax.Array:
             first = jnp.ravel(leaf)[0]
             total = total + jnp.where(first == first, 0, 0).astype(jnp.int32)
     return total
+
+
+def at_once(many: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """A function of one run from a function of many: `vmap` of it, of any depth, is one call of `many`.
+
+    Args:
+        many: takes trees whose arrays lead with the axis of runs, N long, or 1 where all runs share a value that
+            `many` may take as such; the arrays of its first argument are always N long. Returns an array (N, ...).
+
+    Returns:
+        The function of the same arguments without that axis.
+    """
+
+    @custom_vmap
+    def batch(*trees: Any) -> jax.Array:
+        return many(*trees)
+
+    @batch.def_vmap
+    def _(axis_size: int, in_batched: Any, *trees: Any) -> tuple[jax.Array, bool]:
+        leaves, structure = jax.tree.flatten(trees)
+        batched = jax.tree.leaves(in_batched)
+        runs = max(leaf.shape[int(is_batched)] for leaf, is_batched in zip(leaves, batched, strict=True))
+        first = len(jax.tree.leaves(trees[0]))
+
+        def merge(i: int, leaf: jax.Array, is_batched: bool) -> jax.Array:
+            shared = not is_batched and len(leaf) == 1
+            if shared and i >= first:
+                return leaf
+            leaf = leaf if is_batched else leaf[None]
+            leaf = jnp.broadcast_to(leaf, (axis_size, runs, *leaf.shape[2:]))
+            return leaf.reshape(axis_size * runs, *leaf.shape[2:])
+
+        merged = [merge(i, *pair) for i, pair in enumerate(zip(leaves, batched, strict=True))]
+        out = batch(*jax.tree.unflatten(structure, merged))
+        return out.reshape(axis_size, runs, *out.shape[1:]), True
+
+    def one(*trees: Any) -> jax.Array:
+        return batch(*jax.tree.map(lambda x: x[None], trees))[0]
+
+    return one
+
+
+def apart(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
+    """A tree as a list in which every small array stands entry by entry, and the way back.
+
+    A batch of 3x3 matrices lies in memory matrix by matrix, so that arithmetic on one entry strides. Entry by entry,
+    each lies there run beside run, which is what vector instructions want. A loop or branch fixes what lies where.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    leaves = [jnp.asarray(leaf) for leaf in leaves]
+    shapes = [leaf.shape if leaf.ndim in (1, 2) and 0 < leaf.size <= _SMALL else () for leaf in leaves]
+    parts = [leaf[i] if shape else leaf for leaf, shape in zip(leaves, shapes, strict=True) for i in np.ndindex(shape)]
+
+    def together(parts: list[Any]) -> Any:
+        following, whole = iter(parts), []
+        for shape in shapes:
+            some = [next(following) for _ in range(int(np.prod(shape)))]
+            if len(shape) == 2:
+                some = [some[i : i + shape[1]] for i in range(0, len(some), shape[1])]
+            whole.append(stack(some) if shape else some[0])
+        return jax.tree.unflatten(structure, whole)
+
+    return parts, together
+
+
+def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any) -> tuple[Any, Any]:
+    """`jax.lax.scan`, whose carry and results it keeps `apart`."""
+    parts, together = apart(carry)
+    outputs: list[Callable[[list[Any]], Any]] = []
+
+    def turn(parts: list[Any], x: Any) -> tuple[list[Any], list[Any]]:
+        carry, y = body(together(parts), x)
+        y, way_back = apart(y)
+        outputs.append(way_back)
+        return apart(carry)[0], y
+
+    parts, ys = jax.lax.scan(turn, parts, xs)
+    return together(parts), jax.vmap(outputs[-1])(ys) if ys else outputs[-1](ys)
+
+
+def cond(predicate: jax.Array, true: Callable[..., Any], false: Callable[..., Any], *operands: Any) -> Any:
+    """`jax.lax.cond`, which hands operands in and results out `apart`."""
+    parts, together = apart(operands)
+    outputs: list[Callable[[list[Any]], Any]] = []
+
+    def branch(function: Callable[..., Any]) -> Callable[[list[Any]], list[Any]]:
+        def run(parts: list[Any]) -> list[Any]:
+            results, way_back = apart(function(*together(parts)))
+            outputs.append(way_back)
+            return results
+
+        return run
+
+    results = jax.lax.cond(predicate, branch(true), branch(false), parts)
+    return outputs[-1](results)

@@ -50,8 +50,10 @@ def whiten(innovation: jax.Array, S: jax.Array) -> jax.Array:
     Returns:
         (m,), zero where S is zero, as in the reports of empty slots.
     """
-    empty = jnp.all(S == 0)
-    L, D = ldl(Matrix.symmetric(jnp.where(empty, jnp.eye(len(innovation), dtype=S.dtype), S)))
+    n = len(innovation)
+    empty = S[0, 0] == 0  # a variance of zero: there is none
+    rows = [[jnp.where(empty, jnp.asarray(i == j, S.dtype), S[i, j]) for j in range(n)] for i in range(n)]
+    L, D = ldl(Matrix.symmetric(Matrix(rows)))
     return jnp.stack([y / jnp.sqrt(d) for y, d in zip(forward(L, tuple(innovation)), D, strict=True)])
 
 

@@ -5,6 +5,8 @@ Throughout, a pose error is truth minus estimate with the heading wrapped, and J
 
 from __future__ import annotations
 
+import functools
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -12,7 +14,7 @@ import jax.numpy as jnp
 import scipy.special
 
 from jaxlocmap import checks
-from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve
+from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve, stack
 from jaxlocmap.motion import MotionModel, wrap
 
 
@@ -23,19 +25,27 @@ class Update(NamedTuple):
     cov: jax.Array  # (3, 3); unchanged where not accepted
     innovation: jax.Array  # (m,)
     S: jax.Array  # (m, m) covariance of the innovation
-    nis: jax.Array  # () squared Mahalanobis distance of the innovation
+    nis: jax.Array  # () squared Mahalanobis distance of the innovation; NaN where S is not positive definite
     accepted: jax.Array  # () bool
     log_likelihood: jax.Array  # () nats, log N(innovation; 0, S)
 
 
-def gate_threshold(probability: float | None, dimension: int) -> float:
+def gate_threshold(probability: float | jax.Array | None, dimension: int) -> Any:
     """Quantile of χ² with `dimension` degrees: a good observation's distance stays below it with `probability`.
 
+    Args:
+        probability: inside (0, 1), or None for no gate. With two degrees it may also be a traced value, up to 1 for no
+            gate: -2 log(1 - p).
+
     Raises:
-        ValueError: `probability` outside (0, 1); None means no gate and gives infinity.
+        ValueError: a number outside (0, 1), or a traced one with other than two degrees.
     """
     if probability is None:
         return float("inf")
+    if not checks.is_concrete(probability):
+        if dimension != 2:
+            raise ValueError(f"gate probability: expected a number for {dimension} degrees, got a traced value")
+        return -2 * jnp.log1p(-probability)
     if not 0 < probability < 1:
         raise ValueError(f"gate probability: expected a value inside (0, 1), got {probability}")
     return float(2 * scipy.special.gammaincinv(dimension / 2, probability))
@@ -88,7 +98,7 @@ def update(
     H: Matrix | jax.Array,
     R: jax.Array,
     *,
-    threshold: float = float("inf"),
+    threshold: float | jax.Array = float("inf"),
     valid: jax.Array | bool = True,
 ) -> Update:
     """Correct the belief by one observation of any sensor, in Joseph form, if it passes the gate.
@@ -118,20 +128,25 @@ def update(
     r = tuple(residual[i] for i in range(m))
     S = sandwich(H, P) + noise
     L, D = ldl(S)
-    nis: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
+    definite = functools.reduce(jnp.logical_and, [d > 0 for d in D])
+    distance: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
+    nis = jnp.where(definite, distance, jnp.nan)
     log_det = sum(jnp.log(d) for d in D)
-    log_likelihood = -0.5 * (nis + log_det + m * jnp.log(2 * jnp.pi).astype(residual.dtype))
-    # A distance that is no number fails with or without a gate; so does an S that is not positive definite.
-    accepted = jnp.logical_and((nis < threshold) & jnp.isfinite(log_likelihood), valid)
+    log_likelihood = -0.5 * (nis + log_det + m * math.log(2 * math.pi))
+    accepted = jnp.logical_and(nis < threshold, valid)  # what is no number is not below, with or without a gate
 
     K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)  # S is symmetric: row i of K solves S k = (P Hᵀ)_i
     IKH = Matrix.identity(len(P.rows)) - K @ H
     joseph = sandwich(IKH, P) + sandwich(K, noise)
     shift = K @ Matrix([x] for x in r)
-    moved = jnp.stack([mean[0] + shift[0, 0], mean[1] + shift[1, 0], wrap(mean[2] + shift[2, 0])])
+    moved = mean[0] + shift[0, 0], mean[1] + shift[1, 0], wrap(mean[2] + shift[2, 0])
+
+    def chosen(new: Any, old: Any) -> list[jax.Array]:
+        return [jnp.where(accepted, x, y) for x, y in zip(new, old, strict=True)]
+
     return Update(
-        mean=jnp.where(accepted, moved, mean),
-        cov=jnp.where(accepted, joseph.array(cov.dtype), cov),
+        mean=stack(chosen(moved, mean)),
+        cov=stack([chosen(new, old) for new, old in zip(joseph.rows, P.rows, strict=True)]),
         innovation=residual,
         S=S.array(cov.dtype),
         nis=nis,

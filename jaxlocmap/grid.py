@@ -1,128 +1,23 @@
-"""Occupancy grid: which cells a beam crosses, the log-odds update, and how good a map is.
+"""Occupancy grid: the log-odds update, and how good a map is.
 
-Log-odds are in nats; cell [row, column] covers origin + resolution * ([column, row] .. [column + 1, row + 1]).
-A cell index is a floor, so a map has no derivative by the pose (it is zero); by `l_occ` and `l_free` it is exact.
+Log-odds are in nats; cell [row, column] covers origin + resolution * ([column, row] .. [column + 1, row + 1]). The
+derivative of a map by the pose is zero (`beams` takes floors); by `l_occ` and `l_free` it is exact.
 """
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxlocmap import checks
-from jaxlocmap.batching import any_in_batch, zero_like_any
+from jaxlocmap.batching import any_in_batch, at_once, zero_like_any
+from jaxlocmap.beams import Lines, flat_cells, longest_crossing, on_map, trace
 from jaxlocmap.types import GridSpec
-
-# Up to here, cells looked at times cells spanned, a float32 product places every cell of a beam exactly; beyond it
-# takes an integer division.
-_FLOAT_EXACT_CELLS = 1024 * 1024
-
-
-class Beams(NamedTuple):
-    """The cells of one scan: B beams of at most K cells, nearest first."""
-
-    row: jax.Array  # (B, K) int32
-    column: jax.Array  # (B, K) int32
-    free: jax.Array  # (B, K) bool: the beam crosses this cell, and it lies on the map
-    hit: jax.Array  # (B, K) bool: the beam ends in this cell, and it lies on the map
-
-
-def cell_of(point: jax.Array, spec: GridSpec) -> jax.Array:
-    """Column and row of a point: floor((p - origin) / resolution).
-
-    Args:
-        point: (..., 2) x, y in m.
-
-    Returns:
-        (..., 2) int32 column, row; may lie outside the map.
-    """
-    # Far and non-finite points go to a cell just as far outside, instead of wherever an integer wraps to.
-    origin = jnp.broadcast_to(jnp.array(spec.origin, point.dtype), point.shape)
-    cells = jnp.floor((point - origin) / spec.resolution)
-    return jnp.clip(jnp.nan_to_num(cells, nan=-1e6), -1e6, 1e6).astype(jnp.int32)
-
-
-def beam_cells(
-    pose: jax.Array,
-    ranges: jax.Array,
-    beam_angles: jax.Array,
-    *,
-    spec: GridSpec,
-    min_range: float,
-    max_range: float,
-) -> Beams:
-    """The cells every beam of a scan crosses and ends in (Bresenham 1965), all beams at once.
-
-    Cell j of a beam that spans n cells along its major axis and m along its minor lies at j along the major and
-    ceil(j m / n - 1/2) along the minor axis.
-
-    Args:
-        pose: (3,) m, m, rad. ranges: (B,) m. beam_angles: (B,) rad, body frame.
-        min_range: a range at or below is no measurement; nor is one that is not finite.
-        max_range: a range at or above clears up to here and ends in no cell.
-
-    Returns:
-        `Beams`; nothing is free or hit for a robot outside the map, nor beyond the edge.
-
-    Raises:
-        ValueError: a wrong shape.
-    """
-    checks.shape("pose", pose, (3,))
-    checks.shape("beam_angles", beam_angles, (None,))
-    checks.shape("ranges", ranges, np.shape(beam_angles))
-    rows, columns = spec.shape
-    measured = jnp.isfinite(ranges) & (ranges > min_range)
-    reach = jnp.where(measured, jnp.minimum(ranges, max_range), 0.0)
-    # Rotating a table of beam directions costs two products a beam; a cosine a beam costs far more.
-    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    beam_cos, beam_sin = jnp.cos(beam_angles), jnp.sin(beam_angles)
-    direction = jnp.stack([cos * beam_cos - sin * beam_sin, sin * beam_cos + cos * beam_sin], axis=-1)
-    ends = pose[None, :2] + reach[:, None] * direction
-
-    start = cell_of(pose[:2], spec)
-    span = cell_of(ends, spec) - start[None]  # (B, 2)
-    j = jnp.arange(_beam_length(spec, max_range), dtype=jnp.int32)[None]  # (1, K)
-    exact = j.size * _longest_span(spec, max_range) <= _FLOAT_EXACT_CELLS
-    length = jnp.abs(span)
-    n = jnp.max(length, axis=-1, keepdims=True)  # (B, 1)
-    column, row = (
-        start[i] + jnp.sign(span[:, i : i + 1]) * _cells_along(j, length[:, i : i + 1], n, float_exact=exact)
-        for i in (0, 1)
-    )
-
-    on_map = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & _on_map(pose, spec) & measured[:, None]
-    ends_here = (j == n) & (ranges < max_range)[:, None]
-    return Beams(row, column, free=on_map & (j < n), hit=on_map & ends_here)
-
-
-def _on_map(pose: jax.Array, spec: GridSpec) -> jax.Array:
-    cell = cell_of(pose[:2], spec)
-    inside = (cell >= 0) & (cell < jnp.array(spec.shape[::-1], cell.dtype))
-    return jnp.all(inside) & jnp.isfinite(pose[2])
-
-
-def _beam_length(spec: GridSpec, max_range: float) -> int:
-    """Cells of the longest beam that can lie on the map: it leaves the map after the map's longer side."""
-    return min(_longest_span(spec, max_range) + 1, max(spec.shape))
-
-
-def _longest_span(spec: GridSpec, max_range: float) -> int:
-    """Cells from a robot to the end of its longest beam, one spare for rounding."""
-    return math.ceil(max_range / spec.resolution) + 1
-
-
-def _cells_along(j: jax.Array, m: jax.Array, n: jax.Array, *, float_exact: bool) -> jax.Array:
-    """ceil(j m / n - 1/2) for integers j, m <= n: how far along one axis cell j of a beam lies."""
-    n = jnp.maximum(n, 1)
-    if not float_exact:
-        return (2 * j * m + n - 1) // (2 * n)
-    # The argument of the floor keeps 1 / (4 n) away from every integer, more than a float32 product is off by.
-    share = 1 / n.astype(jnp.float32)
-    return (j.astype(jnp.float32) * (m.astype(jnp.float32) * share) + (0.5 - 0.25 * share)).astype(jnp.int32)
 
 
 def update_log_odds(
@@ -144,7 +39,7 @@ def update_log_odds(
     Args:
         log_odds: (rows, columns) nats. pose: (3,) m, m, rad. ranges: (B,) m. beam_angles: (B,) rad, body frame.
         l_occ, l_free: () nats, > 0 and < 0.
-        spec, min_range, max_range: as in `beam_cells`.
+        spec, min_range, max_range: as in `beams.beam_cells`.
 
     Returns:
         (rows, columns) nats. Source: Elfes 1989; Thrun, Burgard & Fox 2005, section 9.2.
@@ -152,24 +47,108 @@ def update_log_odds(
     Raises:
         ValueError: a wrong shape.
     """
+    limits: dict[str, Any] = {"spec": spec, "min_range": min_range, "max_range": max_range}
+    return clamp(add_scan(log_odds, pose, ranges, beam_angles, l_occ, l_free, **limits), spec)
+
+
+def clamp(log_odds: jax.Array, spec: GridSpec) -> jax.Array:
+    """The log-odds within [l_min, l_max], any shape."""
+    return jnp.clip(log_odds, spec.l_min, spec.l_max)
+
+
+def add_scan(
+    log_odds: jax.Array,
+    pose: jax.Array,
+    ranges: jax.Array,
+    beam_angles: jax.Array,
+    l_occ: jax.Array,
+    l_free: jax.Array,
+    *,
+    spec: GridSpec,
+    min_range: float,
+    max_range: float,
+) -> jax.Array:
+    """`update_log_odds` for a loop over scans: the lower clamp is left to one `clamp` after the last.
+
+    A cell that is crossed falls, and a fall below l_min needs no clamp until the cell is raised or read. So a scan
+    clamps the cells its beams end in, before and after it raises them, instead of every cell of the map. What `clamp`
+    makes of the result is what clamping after every scan gives.
+
+    Args, source and errors as in `update_log_odds`; cells of `log_odds` may lie below l_min.
+    """
     checks.shape("log_odds", log_odds, spec.shape)
-    checks.shape("pose", pose, (3,))
-    checks.shape("beam_angles", beam_angles, (None,))
-    # Cells that are not touched get zero added, each somewhere else: one shared address would serialise the adds.
-    beams, cells = len(beam_angles), _beam_length(spec, max_range)
-    zero = zero_like_any(log_odds, pose, ranges, beam_angles, l_occ, l_free)
-    spread = jnp.arange(beams * cells, dtype=jnp.int32).reshape(beams, cells) % log_odds.size + zero
-    zeros = jnp.full(spread.shape, zero.astype(log_odds.dtype))
 
-    def change() -> tuple[jax.Array, jax.Array]:
-        touched = beam_cells(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
-        flat = jnp.where(touched.free | touched.hit, touched.row * spec.shape[1] + touched.column, spread)
-        return flat, jnp.where(touched.hit, l_occ, jnp.where(touched.free, l_free, zeros)).astype(zeros.dtype)
+    def lines(pose: jax.Array, ranges: jax.Array) -> Lines:
+        return trace(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
 
-    # The branch also keeps the compiler from merging this arithmetic into the scatter, where it runs cell by cell.
-    flat, amount = jax.lax.cond(any_in_batch(_on_map(pose, spec)), change, lambda: (spread, zeros))
-    summed = log_odds.ravel().at[flat].add(amount, mode="promise_in_bounds")
-    return jnp.clip(summed.reshape(log_odds.shape), spec.l_min, spec.l_max)
+    # At a branch the compiler writes down what it has; it would otherwise repeat a beam's arithmetic for every cell.
+    zero = zero_like_any(log_odds, pose, ranges, beam_angles)
+    none = jax.tree.map(lambda x: jnp.full(x.shape, zero.astype(x.dtype)), jax.eval_shape(lines, pose, ranges))
+    none = none._replace(last=none.last - 1)
+    seen = jax.lax.cond(any_in_batch(on_map(pose, spec)), lines, lambda *_: none, pose, ranges)
+    l_occ, l_free = (jnp.asarray(x, log_odds.dtype) for x in (l_occ, l_free))
+    return _adder(spec, max_range)(log_odds.ravel(), seen, l_occ, l_free).reshape(spec.shape)
+
+
+@functools.lru_cache(maxsize=64)
+def _adder(spec: GridSpec, max_range: float) -> Callable[..., jax.Array]:
+    """The function that adds a scan to a flat map: (log_odds (cells,), lines, l_occ (), l_free ()) -> (cells,).
+
+    It takes a batch of maps for one long map with one long list of cells: scattering into that costs a third of
+    scattering into many.
+    """
+    size, cells = math.prod(spec.shape), longest_crossing(spec, max_range)
+
+    def index(lines: Lines, first: Any, outside: int) -> tuple[jax.Array, jax.Array]:
+        """Where the cells that beams end in (B,) and cross (B, K) lie in an array whose entry `first` is the map's own
+        first; `outside`, which is no entry, for the rest.
+        """
+        j = jnp.arange(cells, dtype=jnp.int32)[None]
+        crossed = jnp.where(j < lines.free[:, None], first + flat_cells(lines, j, spec), outside)
+        ends = first + flat_cells(lines, lines.last[:, None], spec)[:, 0]
+        return jnp.where(lines.last >= 0, ends, outside), crossed
+
+    def add(flat: jax.Array, ends: jax.Array, crossed: jax.Array, l_occ: jax.Array, l_free: jax.Array) -> jax.Array:
+        strict: dict[str, Any] = {"mode": "drop", "wrap_negative_indices": False}
+        flat = flat.at[ends].set(jnp.maximum(flat.at[ends].get(mode="clip"), spec.l_min), **strict)
+        flat = flat.at[ends].add(l_occ, **strict).at[crossed].add(l_free, **strict)
+        return flat.at[ends].set(jnp.minimum(flat.at[ends].get(mode="clip"), spec.l_max), **strict)
+
+    def many(flats: jax.Array, lines: Lines, l_occ: jax.Array, l_free: jax.Array) -> jax.Array:
+        runs, beams = len(flats), lines.free.shape[1]
+        outside = runs * size
+        lines = jax.tree.map(lambda x: jnp.broadcast_to(x, (runs, *x.shape[1:])), lines)
+
+        def whole(lines: Lines) -> tuple[jax.Array, jax.Array]:
+            return jax.vmap(index, in_axes=(0, 0, None))(lines, jnp.arange(runs, dtype=jnp.int32) * size, outside)
+
+        def nowhere(lines: Lines) -> tuple[jax.Array, jax.Array]:
+            none = outside + zero_like_any(flats, lines)
+            return jnp.full((runs, beams), none), jnp.full((runs, beams, cells), none)
+
+        def amount(value: jax.Array, count: int) -> jax.Array:
+            return value[0] if len(value) == 1 else jnp.repeat(value, count)
+
+        # The second branch to write down what is there, this time where each cell of a beam lies.
+        ends, crossed = jax.lax.cond(jnp.any(lines.free > 0), whole, nowhere, lines)
+        occ, free = amount(l_occ, beams), amount(l_free, beams * cells)
+        return add(flats.ravel(), ends.ravel(), crossed.ravel(), occ, free).reshape(runs, size)
+
+    @jax.custom_jvp
+    def adder(flat: jax.Array, lines: Lines, l_occ: jax.Array, l_free: jax.Array) -> jax.Array:
+        return at_once(many)(flat, lines, l_occ, l_free)
+
+    @adder.defjvp
+    def _(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+        flat, lines, *amounts = primals
+        ends, crossed = index(lines, 0, size)
+
+        def plain(flat: jax.Array, *amounts: jax.Array) -> jax.Array:
+            return add(flat, ends, crossed, *amounts)
+
+        return jax.jvp(plain, (flat, *amounts), (tangents[0], *tangents[2:]))
+
+    return adder
 
 
 def probability(log_odds: jax.Array) -> jax.Array:
@@ -186,10 +165,10 @@ def entropy_bits(log_odds: jax.Array) -> jax.Array:
     Returns:
         () bits; a cell never seen counts one. Source: Cover & Thomas 2006, section 2.1.
     """
-    p = probability(log_odds)
-    # -log p = softplus(-L) and -log(1 - p) = softplus(L): exact where p rounds to 0 or 1.
-    nats = p * jax.nn.softplus(-log_odds) + (1 - p) * jax.nn.softplus(log_odds)
-    return jnp.sum(nats) / math.log(2)
+    # With q = exp(-|L|), the smaller probability is q / (1 + q), and nothing cancels where that is close to none.
+    size = jnp.abs(log_odds)
+    q = jnp.exp(-size)
+    return jnp.sum(jnp.log1p(q) + size * q / (1 + q)) / math.log(2)
 
 
 def brier(log_odds: jax.Array, occupied: jax.Array, where: jax.Array) -> jax.Array:
@@ -227,12 +206,19 @@ def calibration(log_odds: jax.Array, occupied: jax.Array, where: jax.Array, *, b
         `Calibration`. Source: Murphy & Winkler 1977; the error is that of Guo et al. 2017, section 2.
     """
     p = probability(log_odds)
-    index = jnp.where(where, jnp.clip((p * bins).astype(jnp.int32), 0, bins - 1), bins).ravel()
+    index = jnp.where(where, jnp.clip((p * bins).astype(jnp.int32), 0, bins - 1), bins)
 
-    def total(value: jax.Array) -> jax.Array:
-        return jnp.zeros(bins + 1, p.dtype).at[index].add(value.ravel().astype(p.dtype))[:bins]
+    each_bin = jnp.arange(bins, dtype=jnp.int32)[:, None]
 
-    cells, mean, share = total(jnp.ones_like(p)), total(p), total(occupied)
+    def add_row(totals: tuple[jax.Array, ...], now: tuple[jax.Array, ...]) -> tuple[tuple[jax.Array, ...], None]:
+        index, *values = now
+        chosen = index[None] == each_bin
+        return tuple(x + jnp.where(chosen, value[None], 0) for x, value in zip(totals, values, strict=True)), None
+
+    # Row by row, every column by itself, is vector code; a scatter would add one cell after the other.
+    none = jnp.full((bins, p.shape[1]), zero_like_any(log_odds, occupied, where).astype(p.dtype))
+    totals, _ = jax.lax.scan(add_row, (none, none, none), (index, jnp.ones_like(p), p, occupied.astype(p.dtype)))
+    cells, mean, share = (jnp.sum(total, axis=1) for total in totals)
     return Calibration(
         edges=jnp.linspace(0, 1, bins + 1, dtype=p.dtype),
         cells=cells,

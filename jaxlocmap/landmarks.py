@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxlocmap import checks
 from jaxlocmap.linalg import Matrix, mahalanobis, sandwich
 from jaxlocmap.motion import wrap
+from jaxlocmap.trig import arctan2, sin_cos
 
 Offset = tuple[float, float, float]
 
@@ -23,7 +24,7 @@ def _sensor(pose: jax.Array, offset: Offset) -> tuple[jax.Array, jax.Array, jax.
     dx, dy, dtheta = offset
     if dx == 0 and dy == 0:
         return pose[0], pose[1], pose[2] + dtheta, Matrix.identity(3)
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    s, c = sin_cos(pose[2])
     right, up = dx * c - dy * s, dx * s + dy * c
     return pose[0] + right, pose[1] + up, pose[2] + dtheta, Matrix([[1, 0, -up], [0, 1, right], [0, 0, 1]])
 
@@ -43,7 +44,7 @@ def observe(pose: jax.Array, landmark: jax.Array, sensor_offset: Offset = (0.0, 
     """
     x, y, heading, _ = _sensor(pose, sensor_offset)
     dx, dy = landmark[0] - x, landmark[1] - y
-    return jnp.stack([jnp.hypot(dx, dy), wrap(jnp.arctan2(dy, dx) - heading)])
+    return jnp.stack([jnp.hypot(dx, dy), wrap(arctan2(dy, dx) - heading)])
 
 
 def linearise(
@@ -72,7 +73,7 @@ def linearise(
     # Safe on both sides of the select: sqrt and atan2 at 0 have NaN gradients even where they are not chosen.
     dx, dy, q = jnp.where(defined, dx, 1.0), jnp.where(defined, dy, 0.0), jnp.where(defined, q, 1.0)
     r = jnp.sqrt(q)
-    residual = jnp.stack([z[0] - r, wrap(z[1] - jnp.arctan2(dy, dx) + heading)])
+    residual = jnp.stack([z[0] - r, wrap(z[1] - arctan2(dy, dx) + heading)])
     H = Matrix([[-dx / r, -dy / r, 0], [dy / q, -dx / q, -1]]) @ J
     return residual, H, defined
 

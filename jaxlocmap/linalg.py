@@ -16,6 +16,18 @@ import numpy as np
 Scalar = Any  # a Python number or an array of shape ()
 
 
+def stack(entries: Any) -> jax.Array:
+    """Scalars as an array: (n,) from a sequence of them, (n, m) from a sequence of rows.
+
+    A later `array[i, j]` then costs nothing under `vmap`: the compiler sees through concatenations, though not through
+    the reshape in a stack of stacks.
+    """
+    if not isinstance(entries[0], (tuple, list)):
+        return jnp.stack(entries)
+    cells = [[jax.lax.expand_dims(x, (0, 1)) for x in row] for row in entries]
+    return jax.lax.concatenate([jax.lax.concatenate(row, 1) for row in cells], 0)
+
+
 def _mul(a: Scalar, b: Scalar) -> Scalar:
     for one, other in ((a, b), (b, a)):
         if isinstance(one, int):
@@ -73,7 +85,7 @@ class Matrix:
 
     def array(self, dtype: Any) -> jax.Array:
         """The same matrix as an array of shape (n, m)."""
-        return jnp.stack([jnp.stack([jnp.asarray(x, dtype) for x in row]) for row in self.rows])
+        return stack([[jnp.asarray(x, dtype) for x in row] for row in self.rows])
 
     @property
     def shape(self) -> tuple[int, int]:

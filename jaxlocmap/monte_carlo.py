@@ -1,41 +1,39 @@
-"""The map over runs: in chunks, over all local devices, returning sums."""
+"""The map over runs: in chunks, over all devices of all processes, returning sums."""
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import os
+import hashlib
+import itertools
+import json
+import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
-from jax.sharding import PartitionSpec as P
+
+from jaxlocmap import chunks, hosts
+from jaxlocmap.hosts import use_all_cores
+from jaxlocmap.parts import Parts, Split, manifest
+
+__all__ = ["Result", "monte_carlo", "use_all_cores"]
+
+_Arrays = tuple[np.ndarray, ...]  # of a chunk, a part or a study: its sums as one vector, or the leaves of its runs
 
 
 class Result(NamedTuple):
     """What came of a study."""
 
     value: Any  # pytree of float64 NumPy arrays: sums over runs, or every run's own along axis 0
-    compile_s: float  # s; 0 where the program was compiled before
+    chunk: int  # runs that a device computed at once
+    devices: int  # of all processes together
+    processes: int
+    resumed_runs: int  # that were finished before
+    compile_s: float  # s, tracing included; 0 where the program was compiled before
     run_s: float  # s
-
-
-def use_all_cores() -> int:
-    """One JAX device per processor core of this machine, if JAX has not started yet.
-
-    Call it before anything else touches JAX: once JAX has started, its devices are settled and stay as they are.
-
-    Returns:
-        The number of local devices; those of an accelerator where JAX has one.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with contextlib.suppress(RuntimeError):  # started already
-        jax.config.update("jax_num_cpu_devices", cores)
-    return jax.local_device_count()
 
 
 def monte_carlo(
@@ -43,108 +41,165 @@ def monte_carlo(
     key: jax.Array,
     runs: int,
     *args: Any,
-    chunk: int = 256,
+    chunk: int | None = None,
     keep_runs: bool = False,
     devices: Sequence[Any] | None = None,
     progress: Callable[[int], None] | None = None,
+    parts: Parts | None = None,
 ) -> Result:
     """Run a simulation many times and add up what it returns.
 
-    The randomness of run i depends on `key` and i alone, not on the chunk or the device it falls into.
+    The randomness of run i depends on `key` and i alone. A device computes a chunk of consecutive runs and adds them
+    up in the runs' own precision (integers as floats), which is what devices are fast in; the host adds up the chunks
+    in float64, always in the same order. So for one and the same `chunk` the totals are the same to the last bit, on
+    however many devices, in however many processes, interrupted or not. Another chunk changes the order of the
+    additions, and so the last digits of the runs' precision.
+
+    In several processes (`hosts.join`) each computes its share on its own, and all return the whole.
 
     Args:
         one_run: `(key, *args) -> pytree of arrays`. Hashable and equal by value (a function, or an instance of a
             frozen dataclass), so that the same study is compiled once.
         key: of the whole study. runs: how many, >= 1.
         *args: pytrees of arrays handed to every run: parameters, the world. Changing their values compiles nothing.
-        chunk: runs per device and turn. Memory grows with it, not with `runs`.
-        keep_runs: return each run's own values instead of their sums.
+        chunk: runs that a device computes at once. Memory grows with it, not with `runs`. By default that of the
+            study to resume, else chosen from the shapes by `chunks.from_shapes`: the same everywhere, unless there
+            are too few runs to keep all devices busy.
+        keep_runs: return each run's own values instead of their sums; in one process only.
         devices: of `jax.local_devices()`, all by default.
-        progress: called with the number of runs done after each chunk.
+        progress: called with the number of runs done after each turn of the devices; in several processes, as if the
+            others were as far as this one. What it raises ends the study, with every finished part kept in `parts`.
+        parts: where to keep what is finished. `parts.clear()` is the caller's to call, once the result is safe.
 
     Returns:
-        `Result`. Sums are taken in the runs' own precision (integers as floats) within a chunk and in float64 across
-        chunks.
+        `Result`, the same in every process.
 
     Raises:
-        ValueError: `runs` or `chunk` below 1, or no device.
+        ValueError: `runs` or `chunk` below 1 or no whole number, a chunk that does not fit into memory, no device,
+            or `parts` that should be resumed and belong to another study.
         TypeError: a key that is none.
+        OSError: a part cannot be kept; those kept before stay.
     """
-    for name, value in (("runs", runs), ("chunk", chunk)):
-        if int(value) != value or value < 1:
-            raise ValueError(f"{name}: expected at least 1, a whole number, got {value}")
+    hosts.check_count("runs", runs, most=2**31 - 1)  # a run's index is an int32
+    if chunk is not None:
+        hosts.check_count("chunk", chunk)
     if not hasattr(key, "dtype"):
         raise TypeError(f"key: expected one made by jax.random.key, got {key!r}")
     devices = tuple(jax.local_devices() if devices is None else devices)
     if not devices:
         raise ValueError("devices: expected at least one, got none")
-    chunk = min(chunk, -(-runs // len(devices)))
-    width = chunk * len(devices)
+    process, processes = jax.process_index(), jax.process_count()
+    if keep_runs and processes > 1:
+        raise ValueError(f"keep_runs: expected one process, got {processes}")
+    if chunk is None and parts is not None:
+        chunk = parts.recorded_chunk()
+    counts, chosen = hosts.gather(np.array([len(devices), min(chunk or 0, runs)], np.int32)).T
 
-    args = jax.tree.map(jnp.asarray, args)
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (key, args))
-    leaves, structure = jax.tree.flatten(shapes)
-    before = _compiled.cache_info().misses
-    program, seconds = _compiled(one_run, chunk, keep_runs, devices, structure, tuple(leaves))
-    compile_s = seconds if _compiled.cache_info().misses > before else 0.0
+    began, compiled = time.perf_counter(), chunks.compile.cache_info().misses
+    args, platform = jax.tree.map(jnp.asarray, args), devices[0].platform
+    run = chunks.OneRun.of(one_run, key, args)
+    traced = chunks.trace(run)
+    split = Split(runs, int(chosen[0]) or chunks.from_shapes(traced.jaxpr, runs, int(counts.sum()), platform))
+    study: dict[str, Any] = {}
+    if parts is not None or processes > 1:
+        text = traced.lower().as_text()
+        study = manifest(split, text, key, args, keep_runs=keep_runs, platform=platform)
+        _check_agreement(study)
+    if parts is not None:
+        hosts.in_turn(lambda: parts.check(study))
+    program = chunks.compile(run, split.chunk, keep_runs, devices)
+    compile_s = time.perf_counter() - began if chunks.compile.cache_info().misses > compiled else 0.0
 
+    own, finished = range(process, split.parts, processes), set[int]()
+    if parts is not None:
+        finished = hosts.in_turn(lambda: parts.open(study, own))
+    resumed = sum(map(split.runs_of, finished))
+    resumed_runs = int(hosts.gather(np.array(resumed, np.int64)).sum())
+    if parts is not None and resumed_runs:
+        parts.say(f"going on: {resumed_runs:,} of {runs:,} runs are done")
     began = time.perf_counter()
-    parts: list[Any] = []
-    for start in range(0, runs, width):
-        index = np.arange(start, start + width, dtype=np.int32)
-        part = jax.tree.map(np.asarray, program(index, np.int32(runs), key, args))
-        if keep_runs or not parts:
-            parts.append(part)
-        else:
-            parts[0] = jax.tree.map(_add, parts[0], part)
+
+    def report(computed: int) -> None:
         if progress is not None:
-            progress(min(start + width, runs))
-    if keep_runs:
-        value = jax.tree.map(lambda *chunks: np.concatenate(chunks)[:runs], *parts)
-    else:
-        value = jax.tree.map(lambda x: np.asarray(x, np.float64), parts[0])
-    return Result(value, compile_s, time.perf_counter() - began)
+            progress(runs * (resumed + computed) // sum(map(split.runs_of, own)))
+
+    todo = (each for part in own if part not in finished for each in split.chunks_of(part))
+    computed = _compute(program, split, todo, (key, args), report)
+    combine = _concatenate if keep_runs else _add_up
+    totals = _totals(own, finished, split, computed, combine, parts)
+    if processes > 1:
+        totals = _exchange(list(totals), split.parts, traced.out_info)
+    total, run_s = combine(totals), time.perf_counter() - began
+    value = _kept(total, traced.out_info, runs) if keep_runs else _unpacked(total, traced.out_info)
+    return Result(value, split.chunk, int(counts.sum()), processes, resumed_runs, compile_s, run_s)
 
 
-def _add(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.add(a, b, dtype=np.float64)
+def _check_agreement(study: dict[str, Any]) -> None:
+    digest = hashlib.sha256(json.dumps(study).encode()).digest()[:8]
+    digests = hosts.gather(np.frombuffer(digest, np.int64))
+    if np.any(differs := np.any(digests != digests[0], axis=1)):
+        raise ValueError(f"processes: expected the same study in all, process {np.argmax(differs)} has another")
 
 
-@functools.lru_cache(maxsize=64)
-def _compiled(
-    one_run: Callable[..., Any],
-    chunk: int,
-    keep_runs: bool,
-    devices: tuple[Any, ...],
-    structure: Any,
-    leaves: tuple[jax.ShapeDtypeStruct, ...],
-) -> tuple[Callable[..., Any], float]:
-    """The program of one chunk over all devices, and the seconds it took to compile."""
+def _compute(
+    program: chunks.Program, split: Split, todo: Iterator[int], shared: Any, report: Callable[[int], None]
+) -> Iterator[_Arrays]:
+    """Chunk after chunk, as many at a turn as there are devices."""
+    runs, shared = program.place((np.int32(split.runs), shared))
+    devices, done = program.mesh.size, 0
+    while turn := list(itertools.islice(todo, devices)):
+        idle = [0] * (devices - len(turn))  # what these devices compute is not looked at
+        first = np.array([each * split.chunk for each in turn] + idle, np.int32)
+        arrays = map(np.asarray, program.compute(first, runs, *shared))
+        yield from itertools.islice(zip(*arrays, strict=True), len(turn))
+        done += sum(split.runs_in(range(each, each + 1)) for each in turn)
+        report(done)
 
-    def on_device(index: jax.Array, runs: jax.Array, key: jax.Array, args: Any) -> Any:
-        each = jax.vmap(lambda i: one_run(jax.random.fold_in(key, i), *args))(index)
-        if keep_runs:
-            return each
-        live = index < runs  # the last chunk runs past the end
 
-        def total(x: jax.Array) -> jax.Array:
-            weight = live.reshape(-1, *[1] * (x.ndim - 1))
-            x = x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(float)
-            return jax.lax.psum(jnp.sum(jnp.where(weight, x, jnp.zeros_like(x)), axis=0), "runs")
+def _totals(
+    own: range,
+    finished: set[int],
+    split: Split,
+    computed: Iterator[_Arrays],
+    combine: Callable[[Iterable[_Arrays]], _Arrays],
+    parts: Parts | None,
+) -> Iterator[_Arrays]:
+    """Part after part, from disk where it is finished, else computed and kept."""
+    for part in own:
+        if parts is not None and part in finished:
+            yield parts.load(part)
+            continue
+        total = combine(itertools.islice(computed, len(split.chunks_of(part))))
+        if parts is not None:
+            parts.save(part, total)
+        yield total
+    for _ in computed:  # nothing is left but the last report
+        pass
 
-        return jax.tree.map(total, each)
 
-    mesh = Mesh(np.array(devices), ("runs",))
-    # Unchecked, so that `one_run` may use constants without a thought of which values differ between devices.
-    sharded = jax.shard_map(
-        on_device,
-        mesh=mesh,
-        in_specs=(P("runs"), P(), P(), P()),
-        out_specs=P("runs") if keep_runs else P(),
-        check_vma=False,
-    )
-    began = time.perf_counter()
-    index = jax.ShapeDtypeStruct((chunk * len(devices),), np.int32)
-    key, args = jax.tree.unflatten(structure, leaves)
-    program = jax.jit(sharded).lower(index, jax.ShapeDtypeStruct((), np.int32), key, args).compile()
-    return program, time.perf_counter() - began
+def _add_up(sums: Iterable[_Arrays]) -> _Arrays:
+    return (functools.reduce(np.add, (np.asarray(vector, np.float64) for (vector,) in sums)),)
+
+
+def _concatenate(runs: Iterable[_Arrays]) -> _Arrays:
+    return tuple(map(np.concatenate, zip(*runs, strict=True)))
+
+
+def _exchange(own: Sequence[_Arrays], parts: int, outputs: Any) -> Iterator[_Arrays]:
+    """The parts of all processes in order. One of each at a time, so that little memory is taken."""
+    nothing = np.zeros(sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(outputs)))
+    for start in range(0, parts, jax.process_count()):
+        place = start // jax.process_count()
+        together = hosts.gather(own[place][0] if place < len(own) else nothing)
+        yield from ((total,) for total in together[: parts - start])
+
+
+def _unpacked(sums: _Arrays, outputs: Any) -> Any:
+    leaves, structure = jax.tree.flatten(outputs)
+    ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves])
+    pieces = zip(np.split(sums[0], ends[:-1]), leaves, strict=True)
+    return jax.tree.unflatten(structure, [piece.reshape(leaf.shape) for piece, leaf in pieces])
+
+
+def _kept(arrays: _Arrays, outputs: Any, runs: int) -> Any:
+    return jax.tree.unflatten(jax.tree.structure(outputs), [array[:runs] for array in arrays])

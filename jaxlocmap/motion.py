@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap.linalg import Matrix
+from jaxlocmap.trig import sin_cos
 
 
 class MotionModel(NamedTuple):
@@ -31,11 +32,12 @@ def _sinc(h: jax.Array) -> tuple[jax.Array, jax.Array]:
     """sin(h)/h and its derivative: series near zero, where the closed form of the derivative cancels."""
     small = jnp.abs(h) < 0.25
     safe = jnp.where(small, 1.0, h)
-    s = jnp.sin(safe) / safe
+    sin, cos = sin_cos(safe)
+    s = sin / safe
     q = h * h
     value = 1 - q / 6 * (1 - q / 20 * (1 - q / 42 * (1 - q / 72 * (1 - q / 110))))
     slope = -h / 3 * (1 - q / 10 * (1 - q / 28 * (1 - q / 54 * (1 - q / 88))))
-    return jnp.where(small, value, s), jnp.where(small, slope, (jnp.cos(safe) - s) / safe)
+    return jnp.where(small, value, s), jnp.where(small, slope, (cos - s) / safe)
 
 
 def _moved(pose: jax.Array, dx: jax.Array, dy: jax.Array, turn: jax.Array) -> jax.Array:
@@ -43,12 +45,12 @@ def _moved(pose: jax.Array, dx: jax.Array, dy: jax.Array, turn: jax.Array) -> ja
 
 
 def _euler_transition(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.Array:
-    step = control[0] * dt
-    return _moved(pose, step * jnp.cos(pose[2]), step * jnp.sin(pose[2]), control[1] * dt)
+    step, (sin, cos) = control[0] * dt, sin_cos(pose[2])
+    return _moved(pose, step * cos, step * sin, control[1] * dt)
 
 
 def _euler_jacobians(pose: jax.Array, control: jax.Array, dt: jax.Array) -> tuple[Matrix, Matrix]:
-    c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+    s, c = sin_cos(pose[2])
     step = control[0] * dt
     F = Matrix([[1, 0, -step * s], [0, 1, step * c], [0, 0, 1]])
     G = Matrix([[c * dt, 0], [s * dt, 0], [0, dt]])
@@ -58,14 +60,14 @@ def _euler_jacobians(pose: jax.Array, control: jax.Array, dt: jax.Array) -> tupl
 def _arc_transition(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.Array:
     half = 0.5 * control[1] * dt
     chord = control[0] * dt * _sinc(half)[0]
-    direction = pose[2] + half
-    return _moved(pose, chord * jnp.cos(direction), chord * jnp.sin(direction), control[1] * dt)
+    sin, cos = sin_cos(pose[2] + half)
+    return _moved(pose, chord * cos, chord * sin, control[1] * dt)
 
 
 def _arc_jacobians(pose: jax.Array, control: jax.Array, dt: jax.Array) -> tuple[Matrix, Matrix]:
     v, half = control[0], 0.5 * control[1] * dt
     s, slope = _sinc(half)
-    cos, sin = jnp.cos(pose[2] + half), jnp.sin(pose[2] + half)
+    sin, cos = sin_cos(pose[2] + half)
     chord = v * dt * s
     F = Matrix([[1, 0, -chord * sin], [0, 1, chord * cos], [0, 0, 1]])
     lever = 0.5 * v * dt * dt

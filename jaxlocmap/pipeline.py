@@ -7,17 +7,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import checks, ekf, grid
+from jaxlocmap import checks, grid
 from jaxlocmap import landmarks as sensor
-from jaxlocmap.batching import any_in_batch, zero_like_any
-from jaxlocmap.linalg import Matrix, is_psd
-from jaxlocmap.motion import resolve
+from jaxlocmap.batching import any_in_batch, cond, scan, zero_like_any
+from jaxlocmap.stages import Sighting, correct, map_scan, map_spec, predict, sound
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
 
 
@@ -74,6 +73,22 @@ def step(
         ValueError: shapes that do not fit, an unknown motion model, a grid in `config` but none in `state`.
         TypeError: landmark ids that are not integers, a `valid` that is not boolean.
     """
+    state, info = advance(params, state, inputs, landmarks=landmarks, beam_angles=beam_angles, config=config)
+    return settle(state, config=config), info
+
+
+def advance(
+    params: Params,
+    state: State,
+    inputs: Inputs,
+    *,
+    landmarks: jax.Array | None = None,
+    beam_angles: jax.Array | None = None,
+    config: Config,
+) -> tuple[State, Info]:
+    """`step` inside a loop: the same, but cells of the map may stay below l_min until `settle`, which any number of
+    steps can share (`grid.add_scan` says why that changes nothing).
+    """
     _check_step(params, inputs, landmarks, beam_angles, config)
     if config.grid is not None and state.log_odds is None:
         raise ValueError("state.log_odds: expected a map, as init makes with this config, got None")
@@ -82,21 +97,28 @@ def step(
         lambda x: jnp.asarray(x, dtype if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None),
         (params, inputs, landmarks, beam_angles),
     )
-    belief, moved = _predict(params, state.belief, inputs, config)
+    belief, moved = predict(params, state.belief, inputs.control, inputs.dt, config=config)
     belief, slots, observed = _correct_landmarks(params, belief, inputs, landmarks, config)
-    # A second source of corrections goes here: a scan matched against `state.log_odds`, which the map below has not
-    # yet seen. It takes (params, belief, inputs, state.log_odds) and returns a belief and what it reports, as above.
+    # A second source of corrections goes here: a scan matched against `settle(state).log_odds`, which the map below
+    # has not yet seen. It takes (params, belief, inputs, log_odds) and returns a belief and what it reports, as above.
     log_odds = state.log_odds
     if log_odds is not None and inputs.ranges is not None and beam_angles is not None:
-        log_odds = _update_map(params, log_odds, belief.mean, inputs.ranges, beam_angles, config)
+        log_odds = map_scan(params, log_odds, belief.mean, inputs.ranges, beam_angles, config=config)
 
     log_likelihood = state.log_likelihood + jnp.sum(slots.log_likelihood)
     info = Info(
         belief=belief,
         **slots._asdict(),
-        ok=moved & observed & is_psd(Matrix.of(belief.cov)) & jnp.all(jnp.isfinite(belief.mean)),
+        ok=moved & observed & sound(belief),
     )
     return State(belief, log_odds, log_likelihood), info
+
+
+def settle(state: State, *, config: Config) -> State:
+    """The state after `advance` as `step` leaves it: the map within its bounds."""
+    if state.log_odds is None or config.grid is None:
+        return state
+    return state._replace(log_odds=grid.clamp(state.log_odds, config.grid))
 
 
 def collect_info(state: State, info: Info, aside: Any) -> Info:
@@ -139,10 +161,11 @@ def run(
     state = jax.tree.map(lambda x: x + zero.astype(x.dtype), state)
 
     def body(state: State, now: tuple[Inputs, Any]) -> tuple[State, Any]:
-        state, info = step(params, state, now[0], landmarks=landmarks, beam_angles=beam_angles, config=config)
-        return state, collect(state, info, now[1])
+        state, info = advance(params, state, now[0], landmarks=landmarks, beam_angles=beam_angles, config=config)
+        return state, collect(settle(state, config=config), info, now[1])
 
-    return jax.lax.scan(body, state, (inputs, aside))
+    state, collected = scan(body, state, (inputs, aside))
+    return settle(state, config=config), collected
 
 
 def map_scans(
@@ -177,47 +200,20 @@ def map_scans(
     params = Params(*(jnp.asarray(x, log_odds.dtype) for x in params))
 
     def body(log_odds: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        return _update_map(params, log_odds, now[0], now[1], beam_angles, config), None
+        return map_scan(params, log_odds, now[0], now[1], beam_angles, config=config), None
 
-    return jax.lax.scan(body, log_odds, (poses, ranges))[0]
-
-
-def _predict(params: Params, belief: Gaussian, inputs: Inputs, config: Config) -> tuple[Gaussian, jax.Array]:
-    """The moved belief, and whether control and step length were usable. Without a control the robot is taken to
-    stand still, with a belief that grows by Q all the same; without a step length, for a nominal step.
-    """
-    steered = jnp.all(jnp.isfinite(inputs.control))
-    timed = jnp.isfinite(inputs.dt) & (inputs.dt >= 0)
-    mean, cov = ekf.predict(
-        *belief,
-        jnp.where(steered & timed, inputs.control, 0),
-        jnp.where(timed, inputs.dt, config.dt),
-        params.Q,
-        motion=resolve(config.motion),
-        nominal_dt=config.dt,
-    )
-    return Gaussian(mean, cov), steered & timed
-
-
-class _Slots(NamedTuple):
-    """What the observation slots of one step report: the middle of `Info`."""
-
-    innovation: jax.Array
-    S: jax.Array
-    nis: jax.Array
-    accepted: jax.Array
-    log_likelihood: jax.Array
-    row: jax.Array
+    log_odds, _ = scan(body, log_odds, (poses, ranges))
+    return grid.clamp(log_odds, map_spec(config))
 
 
 def _correct_landmarks(
     params: Params, belief: Gaussian, inputs: Inputs, landmarks: jax.Array | None, config: Config
-) -> tuple[Gaussian, _Slots, jax.Array]:
+) -> tuple[Gaussian, Sighting, jax.Array]:
     """The belief after every slot in turn, what each slot reports, and whether every observation could be used."""
     slots = inputs.valid.shape[0]
     zero = zero_like_any(params, belief, inputs, landmarks)
     real = zero.astype(belief.mean.dtype)
-    empty = _Slots(
+    empty = Sighting(
         innovation=jnp.full((slots, 2), real),
         S=jnp.full((slots, 2, 2), real),
         nis=jnp.full(slots, real),
@@ -228,49 +224,28 @@ def _correct_landmarks(
     if landmarks is None or slots == 0:
         return belief, empty, jnp.array(True)
     usable = inputs.valid & jnp.all(jnp.isfinite(inputs.z), axis=-1) & (inputs.landmark < len(landmarks))
-    threshold = ekf.gate_threshold(config.gate_probability, 2)
 
-    def slot(belief: Gaussian, now: tuple[Any, ...]) -> tuple[Gaussian, tuple[_Slots, jax.Array]]:
-        z, landmark, usable, empty = now
-        row = jax.lax.cond(
-            any_in_batch(usable & (landmark < 0)),
-            lambda: jnp.where(
-                landmark < 0, sensor.associate(*belief, z, landmarks, params.R, config.sensor_offset), landmark
-            ),
-            lambda: landmark,
-        )
-        residual, H, defined = sensor.linearise(belief.mean, landmarks[jnp.maximum(row, 0)], z, config.sensor_offset)
-        used = usable & defined
-        update = ekf.update(*belief, residual, H, params.R, threshold=threshold, valid=used)
-        report = _Slots(update.innovation, update.S, update.nis, update.accepted, update.log_likelihood, row)
-        report = jax.tree.map(lambda x, nothing: jnp.where(used, x, nothing), report, empty)
-        return Gaussian(update.mean, update.cov), (report, used & jnp.isfinite(update.log_likelihood))
+    def associate(belief: Gaussian, z: jax.Array, landmark: jax.Array) -> jax.Array:
+        best = sensor.associate(*belief, z, landmarks, params.R, config.sensor_offset)
+        return jnp.where(landmark < 0, best, landmark)
 
-    def correct() -> tuple[Gaussian, tuple[_Slots, jax.Array]]:
-        z = jnp.where(usable[:, None], inputs.z, 0)
-        xs = (z, inputs.landmark.astype(jnp.int32), usable, empty)
-        return jax.lax.scan(slot, belief, xs, unroll=min(slots, 4))
+    def slot(belief: Gaussian, now: tuple[Any, ...]) -> tuple[Gaussian, tuple[Sighting, jax.Array]]:
+        z_range, z_bearing, landmark, usable = now
+        z, unknown = jnp.stack([z_range, z_bearing]), any_in_batch(usable & (landmark < 0))
+        row = cond(unknown, associate, lambda belief, z, landmark: landmark, belief, z, landmark)
+        position = landmarks[jnp.maximum(row, 0)]
+        belief, report, used = correct(params, belief, z, position, row, usable, config=config)
+        return belief, (report, used)
 
-    belief, (report, used) = jax.lax.cond(any_in_batch(usable), correct, lambda: (belief, (empty, usable)))
+    def somebody(belief: Gaussian, z: jax.Array) -> tuple[Gaussian, tuple[Sighting, jax.Array]]:
+        z = jnp.where(usable[:, None], z, 0)
+        return scan(slot, belief, (z[:, 0], z[:, 1], inputs.landmark.astype(jnp.int32), usable))
+
+    def nobody(belief: Gaussian, _: jax.Array) -> tuple[Gaussian, tuple[Sighting, jax.Array]]:
+        return belief, (empty, usable)
+
+    belief, (report, used) = cond(any_in_batch(usable), somebody, nobody, belief, inputs.z)
     return belief, report, jnp.all(used == inputs.valid)
-
-
-def _update_map(
-    params: Params, log_odds: jax.Array, pose: jax.Array, ranges: jax.Array, beam_angles: jax.Array, config: Config
-) -> jax.Array:
-    if config.grid is None:
-        raise ValueError("config.grid: expected the GridSpec that the map was made for, got None")
-    return grid.update_log_odds(
-        log_odds,
-        pose,
-        ranges,
-        beam_angles,
-        params.l_occ,
-        params.l_free,
-        spec=config.grid,
-        min_range=config.min_range,
-        max_range=config.max_range,
-    )
 
 
 def _check_step(

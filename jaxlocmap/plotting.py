@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.patheffects import withStroke
 
 from jaxlocmap.consistency import COVERAGE_LEVELS, chi2_quantile, readable
 from jaxlocmap.types import GridSpec
 
+_BEYOND = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
 _TRUTH, _ESTIMATE, _BAND, _EXPECTED = "0.25", "tab:blue", "tab:green", "tab:orange"
 
 
@@ -75,6 +78,112 @@ def log_nees_figure(path: Path, time: np.ndarray, nees: np.ndarray, report: dict
     _coverage_bars(right, [report[f"coverage_{round(100 * level)}"] for level in COVERAGE_LEVELS])
     figure.suptitle(f"{report['log']} — {report['verdict']}", fontsize=11)
     figure.savefig(path, dpi=120)
+
+
+def precision_figure(path: Path, rows: list[dict[str, Any]]) -> None:
+    """NEES over time in float64 and in float32, and how far the two poses part, as in the rows of precision.py."""
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.axhline(3, color=_TRUTH, ls="--", lw=1, label="3: an honest covariance")
+    for i, row in enumerate(rows):
+        colour, time = f"C{i}", np.array(row["time_s"])
+        name = f"{row['steps']:,} steps, {row['runs']} runs"
+        left.plot(time, row["float64"]["nees_per_bin"], color=colour, lw=1, label=f"{name}, float64")
+        left.plot(time, row["float32"]["nees_per_bin"], "x", color=colour, ms=5, label="the same in float32")
+        right.plot(time, row["float32"]["position_difference_per_bin_m"], color=colour, label=name)
+        short = row["short_form"]["position_difference_per_bin_m"]
+        right.plot(time, short, ":", color=colour, label="with the short form P ← (I − K H) P")
+    left.set(
+        title=f"NEES, mean over runs and a {len(rows[0]['time_s'])}th of the drive",
+        xlabel="time [s]",
+        ylabel="NEES [–]",
+        xscale="log",
+    )
+    right.set(
+        title="Position in float32 against float64: largest over runs",
+        xlabel="time [s]",
+        ylabel="distance [m]",
+        xscale="log",
+        yscale="log",
+    )
+    _from_zero(left)
+    right.legend(fontsize=8)
+    figure.suptitle(rows[-1]["verdict"].replace("; ", "\n"), fontsize=11)
+    figure.savefig(path, dpi=120)
+
+
+def sweep_figure(path: Path, report: dict[str, Any], labels: tuple[str, str], ticks: tuple[list[str], ...]) -> None:
+    """ANEES and position RMSE of every cell of a sweep, the consistent ones outlined, as in the report of sweep.py.
+
+    Where none is consistent, the one that fits best is outlined instead, and the legend says so.
+
+    Args:
+        labels, ticks: of the x and of the y axis.
+    """
+    figure = Figure(figsize=(15, 7), layout="constrained")
+    axes = figure.subplots(1, 2)
+    columns, rows = (len(texts) for texts in ticks)
+    anees, nis, rmse, misfit, consistent = (
+        np.array([cell[name] for cell in report["cells"]], float).reshape(rows, columns)
+        for name in ("anees", "nis_mean", "rmse_position_m", "misfit", "consistent")
+    )
+    factor = float(np.clip(np.exp(np.abs(np.log(_finite(anees) / 3)).max(initial=0)), 1.25, 10))
+    _heat(axes[0], anees, "RdBu_r", span=(3 / factor, 3 * factor))
+    _heat(axes[1], rmse, "viridis_r")
+    axes[0].set_title("Consistent? ANEES [–]: 3; red is over-confident, blue under-confident", fontsize=11)
+    axes[1].set_title("Accurate? Position RMSE [m]", fontsize=11)
+    for values, expected, style, label in ((anees, 3, "-", "ANEES 3"), (nis, 2, "--", "NIS 2")):
+        # Where a sweep crosses the expected value, and does not just rest on it.
+        low, high = _finite(values).min(initial=np.inf), _finite(values).max(initial=0)
+        if min(rows, columns) > 1 and low < 0.8 * expected and high > 1.25 * expected:
+            axes[0].contour(np.log(values / expected), levels=[0], colors="0.3", linestyles=style, linewidths=1.2)
+            axes[0].plot([], [], style, color="0.3", lw=1.2, label=f"{label}, interpolated")
+    outlined, label = consistent > 0, "consistent: ANEES inside its 95 % band, no run lost"
+    if not consistent.any():
+        outlined, label = misfit == misfit.min(), "none is consistent: the best fit of ANEES and NIS"
+    for ax in axes:
+        _outline(ax, outlined, label)
+        ax.set_xticks(range(columns), ticks[0])
+        ax.set_yticks(range(rows), ticks[1])
+        ax.set(xlabel=labels[0], ylabel=labels[1])
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=9, loc="outside lower center", ncols=3)
+    title = f"{report['scenario']}, {report['motion']} motion, {report['runs']} runs a cell"
+    words = [report[name] for name in ("gate_verdict", "verdict") if name in report]
+    figure.suptitle("\n".join([title, *words]), fontsize=11)
+    figure.savefig(path, dpi=120)
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return values[np.isfinite(values)]
+
+
+def _heat(ax: Axes, values: np.ndarray, colours: str, span: tuple[float, float] | None = None) -> None:
+    """One colour a cell on a log scale, and its value where there is room."""
+    some = _finite(values) if np.isfinite(values).any() else np.ones(1)
+    low, high = span or (some.min(), some.max())
+    image = ax.imshow(values, norm=LogNorm(low, high), cmap=colours, origin="lower", aspect="auto")
+    below, above = bool((some < 0.999 * low).any()), bool((some > 1.001 * high).any())
+    bar = ax.figure.colorbar(image, ax=ax, extend=_BEYOND[below, above])
+    ticks = np.geomspace(low, high, 7).tolist()
+    bar.set_ticks(ticks, labels=[readable(tick) for tick in ticks])
+    bar.minorticks_off()
+    if max(values.shape) > 12:
+        return
+    for (i, j), value in np.ndenumerate(values):
+        colour = image.cmap(image.norm(value)) if np.isfinite(value) else (1, 1, 1)
+        dark = np.dot(colour[:3], (0.3, 0.6, 0.1)) < 0.45  # how bright the eye finds red, green, blue
+        ink, halo = ("white", "black") if dark else ("black", "white")
+        effects = [withStroke(linewidth=1, foreground=halo, alpha=0.4)]
+        ax.text(j, i, readable(value), ha="center", va="center", fontsize=8, color=ink, path_effects=effects)
+
+
+def _outline(ax: Axes, cells: np.ndarray, label: str) -> None:
+    """A line around a region of cells."""
+    padded = np.pad(cells, 1)
+    rows, columns = np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1])
+    ax.vlines(columns - 0.5, rows - 0.5, rows + 0.5, color="black", lw=2.5, label=label)
+    rows, columns = np.nonzero(padded[1:, 1:-1] != padded[:-1, 1:-1])
+    ax.hlines(rows - 0.5, columns - 0.5, columns + 0.5, color="black", lw=2.5)
 
 
 def trajectory_figure(

@@ -1,8 +1,9 @@
 """Simulated robots: keys in, `Truth` and `Inputs` out.
 
 A world is data (walls, landmarks), so is the plant's noise; both may differ from run to run under `vmap`. What the
-filter believes, its `Params`, is no part of a simulation. All randomness is a `Draws` of standard normals, so a
-program with a generator of its own can hand in its numbers through `roll_out`.
+filter believes, its `Params`, is no part of a simulation. `drive`, `sight` and `look_round` each make one step out of
+given random numbers, so that a study can simulate and filter in one loop and keep neither; `roll_out` makes a whole
+drive of them, also for a program with a generator of its own.
 """
 
 from __future__ import annotations
@@ -15,15 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlocmap import batching
 from jaxlocmap.motion import wrap
+from jaxlocmap.normals import Words, normals, uniforms, words_of
+from jaxlocmap.trig import arctan2, sin_cos
 from jaxlocmap.types import Config, Gaussian, GridSpec, Inputs, Params, Truth
-
-
-class World(NamedTuple):
-    """What stands around the robot."""
-
-    segments: jax.Array  # (S, 2, 2) m: walls, from point to point
-    landmarks: jax.Array  # (L, 2) m
+from jaxlocmap.world import World, occupancy, ray_cast, room  # noqa: F401 (a simulation needs its world too)
 
 
 class Noise(NamedTuple):
@@ -35,16 +33,19 @@ class Noise(NamedTuple):
     range: jax.Array | float = 0.08  # m, landmark detector
     bearing: jax.Array | float = 0.02  # rad, landmark detector
     scan: jax.Array | float = 0.03  # m, each beam
+    outlier_rate: jax.Array | float = 0.0  # share of sightings that are false, where `Scenario.outliers`
 
 
 class Draws(NamedTuple):
-    """Standard normal numbers, one simulation's worth."""
+    """The random numbers of a drive; what they are for is said where they are used."""
 
-    heading: jax.Array  # (T,)
-    control: jax.Array  # (T, 2)
-    sighting: jax.Array  # (ceil(T / sight_period), L, 2)
-    scan: jax.Array | None  # (T, B); None without a scanner
+    drive: jax.Array  # (T, 3)
+    sighting: jax.Array  # (T, L, 2), or (T, L, 5) with outliers; used at the steps at which the detector looks
+    scan: jax.Array | None = None  # (T, B); None without a scanner
 
+
+# Where each use of a step's random numbers begins.
+_DRIVE, _SIGHTINGS, _SCAN = 0, 1 << 20, 1 << 30
 
 _COURSE_GRID = GridSpec(origin=(0.0, 0.0), resolution=0.2, shape=(120, 120))
 
@@ -66,7 +67,12 @@ class Scenario:
     max_range: float = 8.0  # m
     min_range: float = 0.05  # m
     grid: GridSpec = _COURSE_GRID
+    outliers: bool = False  # some sightings are false: of anything in reach, in any direction
     exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
+
+    def looks(self, k: jax.Array) -> jax.Array:
+        """Whether the detector looks at step k."""
+        return k % self.sight_period == 0
 
     def prior(self) -> Gaussian:
         """The belief at step -1, in the default float type."""
@@ -88,22 +94,17 @@ class Scenario:
         )
 
 
-def room() -> World:
-    """A room of 12 x 12 m with one box in it and four landmarks."""
-    corners = [
-        [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)],
-        [(4.5, 4.0), (7.5, 4.0), (7.5, 6.5), (4.5, 6.5)],
-    ]
-    walls = [(ring[i], ring[(i + 1) % 4]) for ring in corners for i in range(4)]
-    return World(
-        segments=jnp.array(walls),
-        landmarks=jnp.array([[2.0, 10.0], [10.0, 2.5], [9.5, 10.5], [2.0, 5.5]]),
-    )
-
-
 def course_params() -> Params:
     """The noise the course's filter believes in, which is not the plant's: R is too wide, Q's yaw rate too narrow."""
     return Params.from_std(v=0.02, w=0.03, range=0.15, bearing=0.03)
+
+
+def own_params(noise: Noise, dt: float) -> Params:
+    """The robot's own noise, for a filter with `euler` motion, which is the plant's model: the heading noise of a step
+    is what a yaw rate's would be that acts for its length.
+    """
+    w = (float(noise.w) ** 2 + (float(noise.heading) / dt) ** 2) ** 0.5
+    return Params.from_std(v=float(noise.v), w=w, range=float(noise.range), bearing=float(noise.bearing))
 
 
 def _capstone_command(k: jax.Array, pose: jax.Array) -> jax.Array:
@@ -119,7 +120,7 @@ def _loop_command(k: jax.Array, pose: jax.Array) -> jax.Array:
     del k
     dx, dy = pose[0] - _LOOP_CENTRE[0], pose[1] - _LOOP_CENTRE[1]
     outside = jnp.hypot(dx, dy) - _LOOP_RADIUS
-    off_course = wrap(pose[2] - jnp.arctan2(dy, dx) - jnp.pi / 2)
+    off_course = wrap(pose[2] - arctan2(dy, dx) - jnp.pi / 2)
     v = 2 * jnp.pi * _LOOP_RADIUS / (_LOOP_STEPS * 0.1)
     return jnp.stack([jnp.asarray(v, pose.dtype), v / _LOOP_RADIUS + 0.5 * outside - 1.0 * off_course])
 
@@ -152,21 +153,80 @@ def draw_pose(key: jax.Array, prior: Gaussian) -> jax.Array:
     return pose.at[2].set(wrap(pose[2]))
 
 
-def draw(key: jax.Array, *, scenario: Scenario, landmarks: int, scan: bool = True) -> Draws:
-    """The standard normals of one simulation, in the default float type.
+def draw_drive(words: Words, k: jax.Array, dtype: Any) -> jax.Array:
+    """Random numbers for `drive` at step k, (3,). words: of this drive alone, from `normals.words_of`."""
+    return normals(words, k, _DRIVE, 3, dtype)
+
+
+def drive(
+    draws: jax.Array, k: jax.Array, pose: jax.Array, noise: Noise, *, scenario: Scenario
+) -> tuple[jax.Array, jax.Array]:
+    """One step of the plant.
+
+        x ← x + v cos(theta) dt,  y ← y + v sin(theta) dt,  theta ← wrap(theta + omega dt + heading noise)
 
     Args:
-        key: of this simulation alone. scenario: static. landmarks: how many the world has.
-        scan: whether the robot has its scanner on.
+        draws: (3,) standard normals: for heading, v, omega. k: () step, from 0. pose: (3,) m, m, rad, the true pose
+            before. noise: as its fields say. scenario: static.
+
+    Returns:
+        The true pose (3,), and the commanded control with noise (2,), as the robot measures it.
     """
-    heading, control, sighting, beams = jax.random.split(key, 4)
-    looks = -(-scenario.steps // scenario.sight_period)
-    return Draws(
-        heading=jax.random.normal(heading, (scenario.steps,)),
-        control=jax.random.normal(control, (scenario.steps, 2)),
-        sighting=jax.random.normal(sighting, (looks, landmarks, 2)),
-        scan=jax.random.normal(beams, (scenario.steps, scenario.beams)) if scan else None,
-    )
+    v, w = scenario.command(k, pose)
+    sin, cos = sin_cos(pose[2])
+    moved = [
+        pose[0] + v * cos * scenario.dt,
+        pose[1] + v * sin * scenario.dt,
+        wrap(pose[2] + w * scenario.dt + noise.heading * draws[0]),
+    ]
+    return jnp.stack(moved), jnp.stack([v + noise.v * draws[1], w + noise.w * draws[2]])
+
+
+def draw_sighting(words: Words, k: jax.Array, j: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
+    """Random numbers for `sight` of landmark j at step k, (2,) or, with outliers, (5,)."""
+    normal = normals(words, k, _SIGHTINGS + 4 * j, 2, dtype)
+    if not scenario.outliers:
+        return normal
+    uniform = uniforms(words, k, _SIGHTINGS + 4 * j + 1, 3, dtype)
+    return jnp.stack([*normal, *uniform])
+
+
+def sight(
+    draws: jax.Array, pose: jax.Array, landmark: jax.Array, noise: Noise, *, scenario: Scenario
+) -> tuple[jax.Array, jax.Array]:
+    """What the detector makes of a landmark.
+
+    Args:
+        draws: (2,) standard normals for range and bearing; with `scenario.outliers` (5,), then uniform over (0, 1):
+            whether the sighting is false, and of what range and bearing.
+        pose: (3,) m, m, rad, the true one. landmark: (2,) m. noise: as its fields say. scenario: static.
+
+    Returns:
+        Range and bearing (2,) m, rad, and whether the detector reports them, which it does below `sight_range`.
+    """
+    dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
+    reach = jnp.sqrt(dx * dx + dy * dy) + noise.range * draws[0]
+    bearing = arctan2(dy, dx) - pose[2] + noise.bearing * draws[1]
+    if scenario.outliers:
+        false = draws[2] < noise.outlier_rate
+        reach = jnp.where(false, draws[3] * scenario.sight_range, reach)
+        bearing = jnp.where(false, (2 * draws[4] - 1) * jnp.pi, bearing)
+    return jnp.stack([reach, wrap(bearing)]), reach < scenario.sight_range
+
+
+def draw_scan(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
+    """Random numbers for `look_round` at step k, (B,)."""
+    return normals(words, k, _SCAN, scenario.beams, dtype)
+
+
+def look_round(draws: jax.Array, pose: jax.Array, world: World, noise: Noise, *, scenario: Scenario) -> jax.Array:
+    """A scan of the walls, (B,) m. Noise is added after the cut at `max_range`, as the course has it.
+
+    Args:
+        draws: (B,) standard normals. pose: (3,) m, m, rad, the true one. world, noise: as their fields say.
+    """
+    exact = ray_cast(pose, scenario.beam_angles(), world.segments, scenario.max_range)
+    return jnp.maximum(exact + draws * noise.scan, scenario.min_range)
 
 
 def simulate(
@@ -178,127 +238,48 @@ def simulate(
     scenario: Scenario,
     scan: bool = True,
 ) -> tuple[Truth, Inputs]:
-    """One drive: `draw`, then `roll_out`.
+    """One drive.
 
     Args:
         key: of this drive alone. world, noise: as their fields say.
-        start: (3,) m, m, rad, the true pose at step -1: the prior's mean, or one from `draw_pose`.
+        start: (3,) m, m, rad, the true pose at step -1: the prior's mean, or one from `draw_pose`. Its dtype is that
+            of everything that follows.
         scenario: static. scan: False leaves out the scanner, which costs most of a simulation.
 
     Returns:
-        The true poses and what the robot measured, as `roll_out` says.
+        The true poses and what the robot measured, both with a leading axis T: the control with noise; every
+        `sight_period` steps, landmarks in reach, slot j holding landmark j; a scan a step.
     """
-    draws = draw(key, scenario=scenario, landmarks=len(world.landmarks), scan=scan)
-    return roll_out(draws, world, noise, start, scenario=scenario)
+    words, dtype, landmarks = words_of(key), start.dtype, jnp.arange(len(world.landmarks))
+
+    def numbers(k: jax.Array) -> Draws:
+        return Draws(
+            drive=draw_drive(words, k, dtype),
+            sighting=jax.vmap(lambda j: draw_sighting(words, k, j, scenario=scenario, dtype=dtype))(landmarks),
+            scan=draw_scan(words, k, scenario=scenario, dtype=dtype) if scan else None,
+        )
+
+    return roll_out(jax.vmap(numbers)(jnp.arange(scenario.steps)), world, noise, start, scenario=scenario)
 
 
 def roll_out(draws: Draws, world: World, noise: Noise, start: jax.Array, *, scenario: Scenario) -> tuple[Truth, Inputs]:
-    """One drive with given random numbers.
+    """`simulate` with given random numbers."""
 
-        x ← x + v cos(theta) dt,  y ← y + v sin(theta) dt,  theta ← wrap(theta + omega dt + heading noise)
-
-    Args:
-        draws: standard normals. world, noise: as their fields say.
-        start: (3,) m, m, rad, the true pose at step -1.
-        scenario: static.
-
-    Returns:
-        The true poses, and what the robot measured: the commanded control with noise; every `sight_period` steps the
-        range and bearing of each landmark nearer than `sight_range`, slot j holding landmark j; a scan a step if
-        `draws.scan` is there (noise is added after the cut at `max_range`, as the course has it).
-    """
-    steps = jnp.arange(scenario.steps)
-
-    def drive(pose: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Any]:
-        k, kick = now
-        control = scenario.command(k, pose)
-        pose = jnp.stack(
-            [
-                pose[0] + control[0] * jnp.cos(pose[2]) * scenario.dt,
-                pose[1] + control[0] * jnp.sin(pose[2]) * scenario.dt,
-                wrap(pose[2] + control[1] * scenario.dt + noise.heading * kick),
-            ]
+    def body(pose: jax.Array, now: tuple[jax.Array, Draws]) -> tuple[jax.Array, tuple[Truth, Inputs]]:
+        k, draws = now
+        pose, control = drive(draws.drive, k, pose, noise, scenario=scenario)
+        z, near = jax.vmap(lambda d, landmark: sight(d, pose, landmark, noise, scenario=scenario))(
+            draws.sighting, world.landmarks
         )
-        return pose, (pose, control)
+        valid = near & scenario.looks(k)
+        inputs = Inputs(
+            dt=jnp.asarray(scenario.dt, pose.dtype),
+            control=control,
+            landmark=jnp.arange(len(valid), dtype=jnp.int32),
+            z=jnp.where(valid[:, None], z, 0),
+            valid=valid,
+            ranges=None if draws.scan is None else look_round(draws.scan, pose, world, noise, scenario=scenario),
+        )
+        return pose, (Truth(pose), inputs)
 
-    _, (poses, controls) = jax.lax.scan(drive, start, (steps, draws.heading))
-    control = controls + draws.control * jnp.stack([jnp.asarray(noise.v), jnp.asarray(noise.w)])[None]
-
-    count = len(world.landmarks)
-    looking = slice(None, None, scenario.sight_period)
-    delta = world.landmarks[None] - poses[looking, None, :2]
-    exact = jnp.stack(
-        [
-            jnp.hypot(delta[..., 0], delta[..., 1]),
-            jnp.arctan2(delta[..., 1], delta[..., 0]) - poses[looking, None, 2],
-        ],
-        axis=-1,
-    )
-    z = exact + draws.sighting * jnp.stack([jnp.asarray(noise.range), jnp.asarray(noise.bearing)])[None, None]
-    z = z.at[..., 1].set(wrap(z[..., 1]))
-    sighted = z[..., 0] < scenario.sight_range
-    inputs = Inputs(
-        dt=jnp.full(scenario.steps, scenario.dt, poses.dtype),
-        control=control,
-        landmark=jnp.broadcast_to(jnp.arange(count, dtype=jnp.int32)[None], (scenario.steps, count)),
-        z=jnp.zeros((scenario.steps, count, 2), poses.dtype).at[looking].set(z),
-        valid=jnp.zeros((scenario.steps, count), bool).at[looking].set(sighted),
-        ranges=None if draws.scan is None else _scan(draws.scan, poses, world, noise, scenario),
-    )
-    return Truth(poses), inputs
-
-
-def _scan(draws: jax.Array, poses: jax.Array, world: World, noise: Noise, scenario: Scenario) -> jax.Array:
-    cast = jax.vmap(lambda pose: ray_cast(pose, scenario.beam_angles(), world.segments, scenario.max_range))
-    return jnp.maximum(cast(poses) + draws * noise.scan, scenario.min_range)
-
-
-def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_range: float) -> jax.Array:
-    """Distance along each beam to the nearest wall, `max_range` where there is none.
-
-    Args:
-        pose: (3,) m, m, rad. beam_angles: (B,) rad, body frame. segments: (S, 2, 2) m.
-
-    Returns:
-        (B,) m.
-    """
-    cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    table_cos, table_sin = jnp.cos(beam_angles), jnp.sin(beam_angles)
-    dx = (cos * table_cos - sin * table_sin)[:, None]  # (B, 1)
-    dy = (sin * table_cos + cos * table_sin)[:, None]
-    wall = segments[:, 1] - segments[:, 0]  # (S, 2)
-    away = pose[None, :2] - segments[:, 0]  # (S, 2)
-    # pose + t d = a + s wall, by Cramer's rule
-    wall_x, wall_y, away_x, away_y = wall[None, :, 0], wall[None, :, 1], away[None, :, 0], away[None, :, 1]
-    det = dx * wall_y - dy * wall_x  # (B, S)
-    safe = jnp.where(jnp.abs(det) < 1e-9, 1, det)  # a beam along the wall does not hit it
-    s = (dx * away_y - dy * away_x) / safe
-    t = (wall_x * away_y - wall_y * away_x) / safe
-    hits = (jnp.abs(det) >= 1e-9) & (s >= 0) & (s <= 1) & (t >= 0)
-    return jnp.min(jnp.where(hits, t, max_range), axis=1, initial=max_range)
-
-
-def occupancy(world: World, spec: GridSpec) -> jax.Array:
-    """The true map: the cells a wall runs through. A wall along the edge of two cells occupies both.
-
-    Returns:
-        (rows, columns) bool.
-    """
-    rows, columns = spec.shape
-    dtype = world.segments.dtype
-    low_x = spec.origin[0] + spec.resolution * jnp.arange(columns, dtype=dtype)[None, :, None]
-    low_y = spec.origin[1] + spec.resolution * jnp.arange(rows, dtype=dtype)[:, None, None]
-    first, along = (x[None, None] for x in (world.segments[:, 0], world.segments[:, 1] - world.segments[:, 0]))
-    reach = spec.resolution * 1e-3  # a wall on the edge must not depend on rounding
-    enter, leave = jnp.zeros((), dtype), jnp.ones((), dtype)
-    # Clip every wall against every cell, one axis after the other (Liang & Barsky 1984).
-    for axis, low in ((0, low_x), (1, low_y)):
-        near, far = low - reach - first[..., axis], low + spec.resolution + reach - first[..., axis]
-        step = along[..., axis]
-        safe = jnp.where(step != 0, step, 1)
-        t0, t1 = jnp.minimum(near / safe, far / safe), jnp.maximum(near / safe, far / safe)
-        between = (near <= 0) & (far >= 0)
-        across = jnp.broadcast_to(step != 0, near.shape)
-        enter = jnp.maximum(enter, jnp.where(across, t0, jnp.where(between, 0, jnp.inf)))
-        leave = jnp.minimum(leave, jnp.where(across, t1, jnp.where(between, 1, -jnp.inf)))
-    return jnp.any(enter <= leave, axis=-1)
+    return batching.scan(body, start, (jnp.arange(scenario.steps), draws))[1]

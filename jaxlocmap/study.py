@@ -8,170 +8,124 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import consistency, grid, simulate
-from jaxlocmap.pipeline import init, run
-from jaxlocmap.types import Config, Gaussian, Info, Params, State
+from jaxlocmap.batching import cond, scan, zero_like_any
+from jaxlocmap.normals import words_of
+from jaxlocmap.pipeline import init
+from jaxlocmap.scoring import (
+    Kept,
+    Latest,
+    MapTotals,
+    SightingTally,
+    Totals,
+    map_totals,
+    no_sightings,
+    no_steps,
+    run_totals,
+    score_sighting,
+    score_step,
+)
+from jaxlocmap.stages import correct, map_scan, predict, sound
+from jaxlocmap.types import Config, Gaussian, Params
+from jaxlocmap.world import World
 
-# A run has lost the robot where it is further off than this, and all but excludes that itself. The second half spares
-# a filter that has seen nothing for long and says so.
-_LOST_DISTANCE = 1.0  # m
-_LOST_NEES = consistency.chi2_quantile(1 - 1e-6, consistency.POSE_DIMENSION)
-
-
-class MapTotals(NamedTuple):
-    """Of the map at the end of a run, scored on the cells it has seen."""
-
-    entropy_bits: jax.Array  # ()
-    brier: jax.Array  # (), 0 for a run that has seen no cell
-    scored: jax.Array  # () 1 if the run has seen any cell
-    cells: jax.Array  # (bins,) cells by the probability the map gives them
-    probability: jax.Array  # (bins,) sum of those probabilities
-    occupied: jax.Array  # (bins,) how many of those cells are occupied
-
-
-class Totals(NamedTuple):
-    """What a run adds to a study. Every entry is a sum, over steps or observations, then over runs."""
-
-    runs: jax.Array  # ()
-    scored_runs: jax.Array  # () runs with any step scored
-    scored: jax.Array  # (T,) steps whose NEES is finite and not negative
-    nees: jax.Array  # (T,)
-    error_square: jax.Array  # (T, 3) m², m², rad²
-    variance: jax.Array  # (T, 3) the filter's own
-    axis_nees: jax.Array  # (3,) of each axis alone, error² / σ²
-    within_two_sigma: jax.Array  # (3,)
-    covered: jax.Array  # (levels,) steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
-    run_nees: jax.Array  # (2,) the run's average NEES, and its square
-    run_nis: jax.Array  # (2,) the run's average NIS, and its square
-    observing_runs: jax.Array  # () runs with any observation scored
-    observed: jax.Array  # (T,) observations whose NIS is finite
-    unscored_observations: jax.Array  # () the others: a reading or a belief that is no number
-    nis: jax.Array  # (T,)
-    accepted: jax.Array  # (T,)
-    lag_products: jax.Array  # (2,) range, bearing
-    lag_squares: jax.Array  # (2,)
-    lag_pairs: jax.Array  # ()
-    flagged_steps: jax.Array  # () steps whose `Info.ok` is False
-    diverged: jax.Array  # () 1 if the run lost the robot at any step, or ended without a finite belief
-    map: MapTotals | None
-
-
-class _Scored(NamedTuple):
-    """What is kept of a step."""
-
-    error: jax.Array
-    variance: jax.Array
-    nees: jax.Array
-    nis: jax.Array
-    accepted: jax.Array
-    white: jax.Array
-    measured: jax.Array
-    ok: jax.Array
-
-
-def _score(state: State, info: Info, truth: jax.Array) -> _Scored:
-    del state
-    error = consistency.pose_error(truth, info.belief.mean)
-    white = jax.vmap(consistency.whiten)(info.innovation, info.S)
-    # What the filter could not use has S zero; where the belief has broken down, nothing whitens to a number.
-    measured = (info.S[:, 0, 0] > 0) & jnp.all(jnp.isfinite(white), axis=-1)
-    return _Scored(
-        error=error,
-        variance=jnp.diagonal(info.belief.cov),
-        nees=consistency.nees(error, info.belief.cov),
-        nis=jnp.where(measured, info.nis, 0),
-        accepted=info.accepted,
-        white=jnp.where(measured[:, None], white, 0),
-        measured=measured,
-        ok=info.ok,
-    )
+__all__ = ["MapTotals", "Study", "Totals", "summarise"]
 
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """One run of a consistency study: simulate, filter, score. Hashable, so `monte_carlo` compiles it once."""
+    """One run of a consistency study: simulate, filter and score, all in one loop. Hashable, so `monte_carlo` compiles
+    it once.
+
+    Its loop is that of `pipeline.run` over a drive of `simulate.simulate`, step by step; it keeps neither the
+    measurements nor the beliefs, which would have to travel to memory and back.
+    """
 
     scenario: simulate.Scenario
     config: Config  # with a grid, the run maps too
 
     def __call__(
-        self, key: jax.Array, params: Params, world: simulate.World, noise: simulate.Noise, prior: Gaussian
+        self,
+        key: jax.Array,
+        params: Params,
+        world: World,
+        noise: simulate.Noise,
+        prior: Gaussian,
+        gate_probability: jax.Array | None = None,
     ) -> Totals:
-        """Totals of the run that `key` stands for."""
+        """Totals of the run that `key` stands for.
+
+        Args:
+            key: of this run. params: the filter's. world, noise, prior: as their fields say.
+            gate_probability: takes the place of the configuration's; a value, so that a sweep over gates compiles once.
+        """
+        params.check()
+        config, scenario = self.config, self.scenario
+        if gate_probability is not None:
+            config = dataclasses.replace(config, gate_probability=gate_probability)
+        dtype = prior.mean.dtype
+        zero = zero_like_any(key, params, world, noise, prior, gate_probability).astype(dtype)
         start_key, key = jax.random.split(key)
-        start = prior.mean if self.scenario.exact_prior else simulate.draw_pose(start_key, prior)
-        mapping = self.config.grid is not None
-        truth, inputs = simulate.simulate(key, world, noise, start, scenario=self.scenario, scan=mapping)
-        state, steps = run(
-            params,
-            init(prior, config=self.config),
-            inputs,
-            landmarks=world.landmarks,
-            beam_angles=self.scenario.beam_angles(),
-            config=self.config,
-            collect=_score,
-            aside=truth.pose,
+        start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
+        words = words_of(key)
+        landmarks = jnp.arange(len(world.landmarks), dtype=jnp.int32)
+
+        def sight(pose: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
+            """Look for one landmark after the other, and correct by it."""
+
+            def one(carry: tuple[Gaussian, SightingTally], now: tuple[Any, ...]) -> tuple[Any, Latest]:
+                belief, tally = carry
+                j, x, y, latest = now
+                draws = simulate.draw_sighting(words, k, j, scenario=scenario, dtype=dtype)
+                landmark = jnp.stack([x, y])
+                z, valid = simulate.sight(draws, pose, landmark, noise, scenario=scenario)
+                belief, sighting, used = correct(params, belief, z, landmark, j, valid, config=config)
+                one_more, latest = score_sighting(sighting, valid, used, latest)
+                return (belief, jax.tree.map(jnp.add, tally, one_more)), latest
+
+            places = landmarks, world.landmarks[:, 0], world.landmarks[:, 1]
+            (belief, tally), latest = scan(one, (belief, no_sightings(zero)), (*places, latest))
+            return belief, tally, latest
+
+        def look_away(pose: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
+            del pose, k
+            return belief, no_sightings(zero), latest
+
+        def turn(carry: tuple[Any, ...], k: jax.Array) -> tuple[tuple[Any, ...], Kept]:
+            pose, belief, log_odds, latest, steps, sightings = carry
+            pose, control = simulate.drive(simulate.draw_drive(words, k, dtype), k, pose, noise, scenario=scenario)
+            belief, moved = predict(params, belief, control, jnp.asarray(scenario.dt, dtype), config=config)
+            belief, seen, latest = cond(scenario.looks(k), sight, look_away, pose, k, belief, latest)
+            if log_odds is not None:
+                draws = simulate.draw_scan(words, k, scenario=scenario, dtype=dtype)
+                ranges = simulate.look_round(draws, pose, world, noise, scenario=scenario)
+                log_odds = map_scan(params, log_odds, belief.mean, ranges, scenario.beam_angles(), config=config)
+            ok = moved & (seen.unusable == 0) & sound(belief)
+            stepped, error_square, variance = score_step(belief, pose, ok)
+            kept = Kept(stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted)
+            steps, sightings = jax.tree.map(jnp.add, (steps, sightings), (stepped, seen))
+            return (pose, belief, log_odds, latest, steps, sightings), kept
+
+        state = jax.tree.map(lambda x: x + zero, init(prior, config=config))
+        none = jnp.full(landmarks.shape, zero)
+        begin = (
+            start + zero_like_any(key, world, noise, prior).astype(dtype),  # whatever the filter believes
+            state.belief,
+            state.log_odds,
+            Latest(none != 0, (none, none)),
+            no_steps(zero),
+            no_sightings(zero),
         )
-        return _totals(steps, inputs.valid, _map_totals(state.log_odds, world, self.config))
-
-
-def _totals(steps: _Scored, valid: jax.Array, map_totals: MapTotals | None) -> Totals:
-    dtype = steps.nees.dtype
-    scored = jnp.isfinite(steps.nees) & (steps.nees >= 0)  # below zero the covariance is none
-    nees = jnp.where(scored, steps.nees, 0)
-    run_nees = jnp.sum(nees) / jnp.maximum(jnp.sum(scored, dtype=dtype), 1)
-    observed = jnp.sum(steps.measured, dtype=dtype)
-    run_nis = jnp.sum(steps.nis) / jnp.maximum(observed, 1)
-    quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
-    products, squares, pairs = consistency.lag_one(steps.white, steps.measured)
-    far = steps.error[:, 0] ** 2 + steps.error[:, 1] ** 2 > _LOST_DISTANCE**2
-    ended = jnp.all(jnp.isfinite(steps.error[-1])) & jnp.all(jnp.isfinite(steps.variance[-1]))
-    diverged = jnp.any(far & (nees > _LOST_NEES)) | ~ended
-    return Totals(
-        runs=jnp.ones((), dtype),
-        scored_runs=jnp.any(scored).astype(dtype),
-        scored=scored.astype(dtype),
-        nees=nees,
-        error_square=jnp.where(scored[:, None], steps.error**2, 0),
-        variance=jnp.where(scored[:, None], steps.variance, 0),
-        axis_nees=jnp.sum(jnp.where(scored[:, None], steps.error**2 / steps.variance, 0), axis=0),
-        within_two_sigma=jnp.sum(scored[:, None] & (steps.error**2 <= 4 * steps.variance), axis=0).astype(dtype),
-        covered=jnp.stack([jnp.sum(scored & (nees < q)).astype(dtype) for q in quantiles]),
-        run_nees=jnp.stack([run_nees, run_nees**2]),
-        run_nis=jnp.stack([run_nis, run_nis**2]),
-        observing_runs=(observed > 0).astype(dtype),
-        observed=jnp.sum(steps.measured, axis=1).astype(dtype),
-        unscored_observations=jnp.sum(valid & ~steps.measured).astype(dtype),
-        nis=jnp.sum(steps.nis, axis=1),
-        accepted=jnp.sum(steps.accepted, axis=1).astype(dtype),
-        lag_products=products,
-        lag_squares=squares,
-        lag_pairs=pairs,
-        flagged_steps=jnp.sum(~steps.ok).astype(dtype),
-        diverged=diverged.astype(dtype),
-        map=map_totals,
-    )
-
-
-def _map_totals(log_odds: jax.Array | None, world: simulate.World, config: Config) -> MapTotals | None:
-    if log_odds is None or config.grid is None:
-        return None
-    occupied, seen = simulate.occupancy(world, config.grid), log_odds != 0
-    bins, scored = grid.calibration(log_odds, occupied, seen), jnp.any(seen)
-    return MapTotals(
-        entropy_bits=grid.entropy_bits(log_odds),
-        brier=jnp.where(scored, grid.brier(log_odds, occupied, seen), 0),
-        scored=scored.astype(log_odds.dtype),
-        cells=bins.cells,
-        probability=jnp.nan_to_num(bins.probability * bins.cells),
-        occupied=jnp.nan_to_num(bins.frequency * bins.cells),
-    )
+        (pose, belief, log_odds, _, steps, sightings), kept = scan(turn, begin, jnp.arange(scenario.steps))
+        if log_odds is not None and config.grid is not None:
+            log_odds = grid.clamp(log_odds, config.grid)
+        return run_totals(kept, steps, sightings, pose, belief, map_totals(log_odds, world, config))
 
 
 def _mean_over_runs(total_and_square: np.ndarray, runs: int, expected: float) -> consistency.Mean:
@@ -203,7 +157,8 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
     nis = _mean_over_runs(totals.run_nis, round(float(totals.observing_runs)), 2)
     per_step = totals.nees / scored
     band = consistency.chi2_band(consistency.POSE_DIMENSION, runs)
-    rms = np.sqrt(totals.error_square.sum(0) / all_scored)
+    error_square, variance = np.stack(totals.error_square, -1), np.stack(totals.variance, -1)
+    rms = np.sqrt(error_square.sum(0) / all_scored)
     rate = float(totals.accepted.sum()) / observations if observations else math.nan
     lag = totals.lag_products / np.where(totals.lag_squares > 0, totals.lag_squares, np.nan)
     diverged = round(float(totals.diverged))
@@ -226,8 +181,8 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
         "nis_chi2_band_95": [
             consistency.chi2_band(2, round(float(count))) if count else None for count in totals.observed
         ],
-        "rmse_per_step": np.sqrt(totals.error_square / scored[:, None]).tolist(),
-        "sigma_per_step": np.sqrt(totals.variance / scored[:, None]).tolist(),
+        "rmse_per_step": np.sqrt(error_square / scored[:, None]).tolist(),
+        "sigma_per_step": np.sqrt(variance / scored[:, None]).tolist(),
         # Where one axis is claimed too well and another too badly, the NEES of all three can look right.
         "axis_nees": _by_axis(totals.axis_nees / all_scored),
         "within_two_sigma": _by_axis(totals.within_two_sigma / all_scored),

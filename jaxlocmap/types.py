@@ -151,7 +151,7 @@ class Config:
 
     dt: float = 0.1  # s, > 0: the period that Q refers to
     motion: Any = "arc"  # "euler" | "arc" | "capstone" | motion.MotionModel
-    gate_probability: float | None = 0.99  # in (0, 1): share of good observations let in; None: no gate
+    gate_probability: Any = 0.99  # in (0, 1): share of good observations let in; None: no gate
     sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad: sensor in the body frame
     grid: GridSpec | None = None  # None: localisation alone
     min_range: float = 0.05  # m: a range at or below is no measurement
@@ -161,11 +161,12 @@ class Config:
         _freeze_tuples(self, "sensor_offset")
         for name in ("dt", "min_range", "max_range"):
             checks.number(name, getattr(self, name))
-        if self.gate_probability is not None:
-            checks.number("gate_probability", self.gate_probability)
+        gate = self.gate_probability if checks.is_concrete(self.gate_probability) else None
+        if gate is not None:
+            checks.number("gate_probability", gate)
         if not (math.isfinite(self.dt) and self.dt > 0):
             raise ValueError(f"dt: expected seconds > 0, got {self.dt}")
-        if self.gate_probability is not None and not 0 < self.gate_probability < 1:
+        if gate is not None and not 0 < gate < 1:
             raise ValueError(
                 f"gate_probability: expected a probability inside (0, 1), or None for no gate, "
                 f"got {self.gate_probability}"

@@ -104,6 +104,27 @@ def test_no_gate_lets_everything_in():
     assert ekf.gate_threshold(None, 2) == math.inf
 
 
+def test_a_traced_gate_is_the_same_quantile_and_one_of_1_is_none(tolerance):
+    p = np.array([0.5, 0.95, 0.99, 1.0])
+    got = jax.jit(lambda p: ekf.gate_threshold(p, 2))(jnp.array(p))
+    np.testing.assert_allclose(got, scipy.stats.chi2.ppf(p, 2), rtol=tolerance(1e-12, 1e-5))  # 0.01 of a float32 0.99
+
+
+def test_a_traced_gate_is_for_two_dimensions():
+    with pytest.raises(ValueError, match="gate probability: expected a number for 3 degrees, got a traced value"):
+        jax.eval_shape(lambda p: ekf.gate_threshold(p, 3), 0.9)
+
+
+def test_a_threshold_may_be_a_value_of_each_run():
+    args = [jnp.array(x) for x in (MEAN, COV, np.array([0.1, 0.2]), np.eye(2, 3), R)]
+    distance = ekf.update(*args).nis
+    thresholds = distance * jnp.array([0.9, 1.1, math.inf])
+    update = jax.vmap(lambda threshold: ekf.update(*args, threshold=threshold))(thresholds)
+    assert update.accepted.tolist() == [False, True, True]
+    np.testing.assert_array_equal(update.mean[0], MEAN.astype(update.mean.dtype))
+    np.testing.assert_array_equal(update.mean[1], ekf.update(*args).mean)
+
+
 @pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, 2.0, math.nan])
 def test_a_gate_that_is_no_probability_is_refused(probability):
     with pytest.raises(ValueError, match=r"gate probability: expected a value inside \(0, 1\), got"):
@@ -188,12 +209,21 @@ def test_a_residual_that_is_no_number_never_passes_even_without_a_gate(bad):
 
 
 def test_an_innovation_covariance_that_is_not_definite_never_passes():
-    """R = -9 I makes S negative definite: a residual of zero then has a distance of zero, inside any gate."""
+    """R = -9 I makes S negative definite: a residual of zero would have a distance of zero, inside any gate."""
     args = [jnp.array(x) for x in (MEAN, COV, np.zeros(2), np.eye(2, 3), -9 * np.eye(2))]
     update = ekf.update(*args, threshold=9.21)
-    assert float(update.nis) == 0
+    assert np.isnan(update.nis)
     assert not update.accepted
     np.testing.assert_array_equal(update.mean, args[0])
+    np.testing.assert_array_equal(update.cov, args[1])
+
+
+@pytest.mark.parametrize("variances", [(1.0, math.inf), (math.inf, 1.0), (math.inf, math.inf)])
+def test_an_infinite_variance_never_passes(variances):
+    """It would leave 0 · inf in the covariance."""
+    args = [jnp.array(x) for x in (MEAN, COV, np.array([0.1, 0.2]), np.eye(2, 3), np.diag(variances))]
+    update = ekf.update(*args)
+    assert not update.accepted
     np.testing.assert_array_equal(update.cov, args[1])
 
 

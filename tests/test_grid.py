@@ -1,6 +1,7 @@
 """The occupancy grid against the reference's loops, what no scan may do to it, and the scores of a map."""
 
 import functools
+import itertools
 import math
 
 import jax
@@ -10,7 +11,6 @@ import pytest
 import reference
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from jax.test_util import check_grads
 
 from jaxlocmap import GridSpec, grid
 
@@ -55,79 +55,6 @@ def reference_scan(ranges, *, pose=POSE, angles=ANGLES, before=None):
 def same(tolerance):
     """Maps that differ by no more than the order of a few sums."""
     return functools.partial(np.testing.assert_allclose, rtol=0, atol=tolerance(1e-12, 1e-5))
-
-
-# --- cells of a beam
-
-
-def cells_to(ends, *, resolution, shape, start, max_range):
-    """Cells (row, column) of the beams from the middle of cell `start` to that of each of `ends`, as (B, K) arrays."""
-    span = np.asarray(ends) - start
-    beams = grid.beam_cells(
-        jnp.array([*((np.asarray(start) + 0.5) * resolution), 0.0]),
-        jnp.array(np.hypot(*span.T) * resolution),
-        jnp.array(np.arctan2(span[:, 1], span[:, 0])),
-        spec=GridSpec(origin=(0.0, 0.0), resolution=resolution, shape=shape),
-        min_range=0.0,
-        max_range=max_range,
-    )
-    return jax.tree.map(np.asarray, beams)
-
-
-def assert_bresenham(beams, start, ends):
-    assert np.all(beams.hit.sum(1) == 1)
-    for column, row, free, hit, end in zip(beams.column, beams.row, beams.free, beams.hit, ends, strict=True):
-        along = free | hit
-        got = list(zip(column[along].tolist(), row[along].tolist(), strict=True))
-        assert got == reference.bresenham(*start, *end)
-        assert hit[along][-1]
-
-
-def test_every_beam_of_up_to_45_cells_is_bresenhams():
-    ends = [(x, y) for x in range(91) for y in range(91) if (x, y) != (45, 45)]
-    beams = cells_to(ends, resolution=1.0, shape=(91, 91), start=(45, 45), max_range=70.0)
-    assert_bresenham(beams, (45, 45), ends)
-
-
-def long_ends(count, reach):
-    """Ends of beams of about `reach` cells in all directions of a quadrant."""
-    angle = np.linspace(0, np.pi / 2, count)
-    return np.floor(reach * np.column_stack([np.cos(angle), np.sin(angle)])).astype(int)
-
-
-@pytest.mark.usefixtures("x64")  # a cell's middle at 2000 cells is 1e-4 of its distance from the edge in float32
-def test_beams_of_more_than_a_thousand_cells_are_bresenhams():
-    ends = long_ends(60, 1990)
-    beams = cells_to(ends, resolution=0.01, shape=(2000, 2000), start=(0, 0), max_range=20.0)
-    assert beams.row.shape[1] > 1024  # these take the integer division
-    assert_bresenham(beams, (0, 0), ends)
-
-
-def test_integer_and_float_division_place_the_same_cells():
-    """All m of a beam of n cells, up to the longest for which the float product is used."""
-    for cells in (1024, 997, 30, 1):
-        n, m = jnp.full((cells + 1, 1), cells, jnp.int32), jnp.arange(cells + 1, dtype=jnp.int32)[:, None]
-        j = jnp.arange(cells, dtype=jnp.int32)[None]
-        fast, slow = (grid._cells_along(j, m, n, float_exact=exact) for exact in (True, False))
-        np.testing.assert_array_equal(fast, slow)
-
-
-@pytest.mark.usefixtures("x64")
-def test_a_beam_far_longer_than_the_map_is_bresenhams_as_far_as_the_map_goes():
-    """1000 cells of a beam of thousands: a float32 product would misplace some."""
-    span, side = 3948, 1000
-    ends = np.array([(span, m) for m in range(0, span + 1, 3)])
-    beams = cells_to(ends, resolution=0.1, shape=(side, side), start=(0, 0), max_range=600.0)
-    j = np.arange(side)
-    expected = (2 * j * ends[:, 1:] + span - 1) // (2 * span)
-    np.testing.assert_array_equal(beams.row, expected)
-    np.testing.assert_array_equal(beams.free, expected < side)
-    assert not np.any(beams.hit)
-
-
-def test_cell_of_a_point_is_a_floor_and_may_lie_outside():
-    points = jnp.array([[-1.0, 0.5], [-1.01, 0.49], [4.99, 4.49], [5.0, 4.5]])
-    np.testing.assert_array_equal(grid.cell_of(points, SPEC), [[0, 0], [-1, -1], [23, 15], [24, 16]])
 
 
 # --- one scan
@@ -252,32 +179,199 @@ def test_no_scan_leaves_the_bounds_or_touches_a_cell_out_of_its_reach(x, y, head
     np.testing.assert_array_equal(after[untouched], before[untouched])
 
 
-def test_robots_at_once_are_robots_one_by_one():
-    """One of them stands outside the map, and changes neither its own nor the others' map."""
-    rng = np.random.default_rng(3)
-    poses = np.column_stack([rng.uniform(-0.9, 4.9, 4), rng.uniform(0.6, 4.4, 4), rng.uniform(-3, 3, 4)])
-    poses[2, 0] = 9.0
-    ranges = rng.uniform(0.0, 5.0, (4, 9))
-    before = rng.uniform(-1, 1, (4, *SPEC.shape))
-    batch = jax.vmap(scanned, in_axes=(0, 0, 0, None))(*(jnp.array(a) for a in (before, poses, ranges, ANGLES)))
-    for got, pose, r, b in zip(batch, poses, ranges, before, strict=True):
-        np.testing.assert_array_equal(got, scan(r, pose=pose, before=b))
+def test_a_map_shorter_than_its_beams_is_cleared_from_edge_to_edge():
+    """Along its longer side too."""
+    spec = GridSpec((0.0, 0.0), 0.5, (3, 7))  # 3.5 m by 1.5 m
+    pose, angles = jnp.array([0.2, 0.7, 0.0]), jnp.array([0.0, math.pi / 2])
+    map_ = scanned(jnp.zeros(spec.shape), pose, jnp.full(2, 3.9), angles, spec=spec)
+    expected = np.zeros(spec.shape, map_.dtype)
+    expected[1] = expected[2, 0] = L_FREE
+    expected[1, 0] = 2 * np.float32(L_FREE)
+    np.testing.assert_allclose(map_, expected, rtol=1e-6)
+
+
+# --- scan after scan, clamped below at the end alone
+
+
+@functools.partial(jax.jit, static_argnames=("at_the_end", "settled", "angles"))
+def mapped(log_odds, poses, ranges, l_occ=L_OCC, l_free=L_FREE, *, at_the_end=True, settled=True, angles=tuple(ANGLES)):
+    """The map after several scans: each clamped, or only the last."""
+    limits = {"spec": SPEC, "min_range": MIN_RANGE, "max_range": MAX_RANGE}
+    add = grid.add_scan if at_the_end else grid.update_log_odds
+
+    def body(log_odds, now):
+        return add(log_odds, *now, jnp.array(angles), l_occ, l_free, **limits), None
+
+    log_odds, _ = jax.lax.scan(body, log_odds, (poses, ranges))
+    return grid.clamp(log_odds, SPEC) if settled else log_odds
+
+
+def drive(seed, scans=40):
+    """Poses and ranges that clear the same cells again and again, then hit them, then both; on and beside the map."""
+    rng = np.random.default_rng(seed)
+    poses = np.tile(POSE, (scans, 1)) + rng.normal(size=(scans, 3)) * [0.02, 0.02, 0.01]
+    ranges = rng.uniform(2.5, 5.0, (scans, len(ANGLES)))
+    ranges[scans // 3 : scans // 2] = rng.choice([0.6, 0.8, 1.0], (1, len(ANGLES)))  # in the middle of what was cleared
+    ranges[scans // 2 :] = rng.uniform(0.0, 5.0, (scans - scans // 2, len(ANGLES)))
+    poses[-scans // 4 :, :2] = rng.uniform([-2, 0], [6, 5], (scans // 4, 2))
+    return jnp.array(poses), jnp.array(ranges)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_one_lower_clamp_after_all_scans_is_one_after_every_scan(seed, same):
+    poses, ranges = drive(seed)
+    before = jnp.array(np.random.default_rng(seed).uniform(SPEC.l_min, SPEC.l_max, SPEC.shape))
+    lazy, every = (mapped(before, poses, ranges, at_the_end=at_the_end) for at_the_end in (True, False))
+    np.testing.assert_array_equal(lazy, every)
+    expected = np.asarray(before, float)
+    for pose, scan_ranges in zip(np.asarray(poses, float), np.asarray(ranges, float), strict=True):
+        expected = reference_scan(scan_ranges, pose=pose, before=expected)
+    if jax.config.jax_enable_x64:  # in float32 an end may fall across the edge of a cell
+        same(lazy, expected)
+
+
+def test_cells_fall_below_the_clamp_and_rise_from_it():
+    """What the test above is about. No cell passes the upper one."""
+    poses, ranges = drive(0)
+    clears, hits = slice(0, 13), slice(13, 20)
+    fallen = unclamped(jnp.zeros(SPEC.shape), poses[clears], ranges[clears])
+    assert fallen.min() < SPEC.l_min - 10
+    hit = jnp.tile(poses[hits][:1], (13, 1)), jnp.tile(ranges[hits][:1], (13, 1))
+    once = unclamped(jnp.array(fallen), hit[0], hit[1].at[1:].set(jnp.nan))
+    raised = (fallen < SPEC.l_min - 1) & (once > fallen)
+    assert raised.sum() >= 3
+    assert np.all(once[raised] > SPEC.l_min)
+    assert unclamped(jnp.array(once), *hit).max() == SPEC.l_max
+
+
+def unclamped(*args, **kwargs):
+    return np.asarray(mapped(*args, settled=False, **kwargs))
+
+
+def test_a_cell_below_the_clamp_that_is_both_crossed_and_hit_counts_from_the_clamp(same):
+    """Three beams cross it and two end in it, within one scan."""
+    before = np.full(SPEC.shape, SPEC.l_min - 7)
+    ranges = jnp.array([[2.0, 2.0, 2.0, 1.0, 1.0] + [math.nan] * 4])
+    after = unclamped(jnp.array(before), jnp.array([[0.1, 2.1, 0.0]]), ranges, angles=(0.0,) * 9)
+    same(after[6, 8], SPEC.l_min + 3 * L_FREE + 2 * L_OCC)
+    same(after[6, 7], before[6, 7] + 5 * L_FREE)
+    same(after[5], before[5])
+
+
+# --- many at once
+
+BATCH = {  # one of the robots stands outside the map, one has no heading
+    "log_odds": np.random.default_rng(0).uniform(-6, 4, (4, *SPEC.shape)),
+    "pose": np.array([[0.63, 2.41, 0.3], [9.0, 2.0, 1.0], [4.1, 1.2, -2.0], [1.0, 2.0, np.nan]]),
+    "ranges": np.random.default_rng(1).uniform(0.0, 5.0, (4, len(ANGLES))),
+    "l_occ": np.array([0.85, 0.5, 1.0, 0.7]),
+    "l_free": np.array([-0.4, -0.5, -0.1, -0.3]),
+}
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def batched(levels, args):
+    """`add_scan` under one vmap a level, each over the arguments of the names it lists."""
+
+    def one(args):
+        limits = {"spec": SPEC, "min_range": MIN_RANGE, "max_range": MAX_RANGE}
+        return grid.add_scan(**args, beam_angles=jnp.array(ANGLES), **limits)
+
+    for names in reversed(levels):
+        one = jax.vmap(one, in_axes=({name: 0 if name in names else None for name in BATCH},))
+    return one(args)
+
+
+EVERYTHING = tuple(BATCH)
+LINES = ("pose", "ranges")
+LEVELS = [
+    [("log_odds",)],
+    [("l_occ",)],
+    [("l_free",)],
+    [LINES],
+    [EVERYTHING],
+    [EVERYTHING, EVERYTHING],
+    [("l_free",), ("log_odds", *LINES)],
+    [("log_odds",), ("l_occ", *LINES)],
+]
+
+
+@pytest.mark.parametrize("levels", LEVELS, ids=lambda levels: "-of-".join("+".join(names) for names in levels))
+def test_robots_at_once_are_robots_one_by_one(levels):
+    """Whatever they share. With two levels, the outer two of two."""
+    shape = (2, 2) if len(levels) == 2 else (4,)
+    args = {}
+    for name, value in BATCH.items():
+        value = value.reshape(*shape, *value.shape[1:])
+        for axis in reversed(range(len(levels))):
+            value = value if name in levels[axis] else value.take(0, axis)
+        args[name] = jnp.array(value)
+    got = batched(tuple(levels), args)
+    for place in itertools.product(*map(range, shape)):
+        own = {
+            name: value[tuple(i for i, names in zip(place, levels, strict=True) if name in names)]
+            for name, value in args.items()
+        }
+        np.testing.assert_array_equal(got[place], batched((), own))
 
 
 # --- gradients
 
+WEIGHTS = np.random.default_rng(1).normal(size=SPEC.shape)
+
+
+STEP = 1e-5  # of a difference, whose next term is its square times a third derivative of order ten thousand
+
+
+def curved(given, poses, ranges):
+    """A score of the map before, l_occ and l_free that has a second derivative."""
+    return jnp.sum(jnp.array(WEIGHTS) * jnp.sin(mapped(given[0], poses, ranges, *given[1:])))
+
+
+def derivatives(given, direction, poses, ranges):
+    """First derivative, forward and reverse, and second, along a direction."""
+    score = functools.partial(curved, poses=poses, ranges=ranges)
+    _, forward = jax.jvp(score, (given,), (direction,))
+    gradient, bend = jax.jvp(jax.grad(score), (given,), (direction,))
+    return forward, gradient, bend
+
+
+def along(tree, direction):
+    return sum(np.vdot(a, b) for a, b in zip(jax.tree.leaves(tree), jax.tree.leaves(direction), strict=True))
+
+
+def lane(tree, index):
+    return jax.tree.map(lambda x: x[index], tree)
+
 
 @pytest.mark.usefixtures("x64")
-def test_gradient_by_the_sensor_model_is_exact():
-    """Linear in l_occ and l_free where no cell is clamped, so finite differences are exact to rounding."""
-    ranges = jnp.array(np.random.default_rng(0).uniform(0.5, 5.0, 9))
-    weights = jnp.array(np.random.default_rng(1).normal(size=SPEC.shape))
-
-    def score(l_occ, l_free):
-        after = scanned(jnp.zeros(SPEC.shape), jnp.array(POSE), ranges, jnp.array(ANGLES), l_occ, l_free)
-        return jnp.sum(weights * after)
-
-    check_grads(score, (0.3, -0.1), order=1, modes=("fwd", "rev"), atol=1e-7, rtol=1e-7)
+def test_derivatives_through_the_clamps_are_finite_differences_alone_and_in_a_batch():
+    """By the map before, l_occ and l_free; cells sit at both clamps, where the derivative is zero."""
+    rng = np.random.default_rng(5)
+    scans = jax.tree.map(lambda *x: jnp.stack(x), *(drive(seed, scans=12) for seed in (0, 2)))
+    given = (
+        jnp.array(rng.uniform(-4.5, 3.9, (2, *SPEC.shape))).at[:, 4:11, 8:16].set(3.9),
+        jnp.array([0.83, 0.7]),
+        jnp.array([-0.37, -0.41]),
+    )
+    direction = jax.tree.map(lambda x: jnp.array(rng.normal(size=x.shape)), given)
+    score, slopes = jax.jit(curved), jax.jit(derivatives)
+    batch = jax.jit(jax.vmap(derivatives))(given, direction, *scans)
+    summed = jax.jit(jax.grad(lambda given: jnp.sum(jax.vmap(curved)(given, *scans))))(given)
+    for i in range(2):
+        here, way, both = lane(given, i), lane(direction, i), lane(scans, i)
+        after = mapped(here[0], *both, *here[1:])
+        assert np.any(after == SPEC.l_min)
+        assert np.any(after == SPEC.l_max)
+        ahead, behind = (jax.tree.map(lambda x, d, step=step: x + step * d, here, way) for step in (STEP, -STEP))
+        forward, gradient, bend = slopes(here, way, *both)
+        np.testing.assert_allclose(forward, (score(ahead, *both) - score(behind, *both)) / (2 * STEP), rtol=1e-6)
+        np.testing.assert_allclose(along(gradient, way), forward, rtol=1e-12)
+        either = slopes(ahead, way, *both)[0] - slopes(behind, way, *both)[0]
+        np.testing.assert_allclose(along(bend, way), either / (2 * STEP), rtol=1e-6)
+        exact = functools.partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
+        jax.tree.map(exact, lane(batch, i), (forward, gradient, bend))
+        jax.tree.map(exact, lane(summed, i), gradient)
 
 
 def test_gradient_by_pose_and_ranges_is_zero():
@@ -290,14 +384,17 @@ def test_gradient_by_pose_and_ranges_is_zero():
 
 # --- scores of a map
 
+entropy_bits, brier = jax.jit(grid.entropy_bits), jax.jit(grid.brier)
+calibration = jax.jit(grid.calibration, static_argnames="bins")
+
 
 def test_entropy_of_what_is_not_known_is_a_bit_a_cell(tolerance):
-    assert float(grid.entropy_bits(jnp.zeros((5, 7)))) == pytest.approx(35.0, rel=tolerance(1e-15, 1e-6))
+    assert float(entropy_bits(jnp.zeros((5, 7)))) == pytest.approx(35.0, rel=tolerance(1e-15, 1e-6))
 
 
 def test_entropy_by_hand(tolerance):
     """p = 3/4: -(3/4 log2 3/4 + 1/4 log2 1/4) = 0.811278; certainty, even where p rounds to 1, is 0 bits."""
-    bits = grid.entropy_bits(jnp.array([[math.log(3), -math.log(3), 800.0, -800.0]]))
+    bits = entropy_bits(jnp.array([[math.log(3), -math.log(3), 800.0, -800.0]]))
     assert float(bits) == pytest.approx(2 * 0.8112781244591328, rel=tolerance(1e-14, 1e-6))
 
 
@@ -305,31 +402,41 @@ def test_entropy_is_numpys(tolerance):
     log_odds = np.random.default_rng(0).uniform(-4, 4, (6, 5))
     p = reference.probability(log_odds)
     expected = np.sum(-p * np.log2(p) - (1 - p) * np.log2(1 - p))
-    assert float(grid.entropy_bits(jnp.array(log_odds))) == pytest.approx(expected, rel=tolerance(1e-13, 1e-6))
+    assert float(entropy_bits(jnp.array(log_odds))) == pytest.approx(expected, rel=tolerance(1e-13, 1e-6))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-3, 1.0, 20.0, 60.0])
+def test_entropy_loses_no_digit_where_a_cell_is_all_but_certain(size, tolerance):
+    """p of the less likely is e^-L / (1 + e^-L): in a cell that is free or occupied alike."""
+    q = math.exp(-size)
+    bits = (math.log1p(q) + size * q / (1 + q)) / math.log(2)
+    for log_odds in (size, -size):
+        got = entropy_bits(jnp.full((1, 1), log_odds))
+        assert float(got) == pytest.approx(bits, rel=tolerance(1e-14, 1e-6))
 
 
 def test_brier_by_hand():
     """Probabilities 3/4, 1/4, 1/2 of occupied, free, not scored: (1/16 + 1/16) / 2."""
     log_odds = jnp.array([[math.log(3), -math.log(3), 0.0]])
-    score = grid.brier(log_odds, jnp.array([[True, False, True]]), log_odds != 0)
+    score = brier(log_odds, jnp.array([[True, False, True]]), log_odds != 0)
     assert float(score) == pytest.approx(1 / 16, rel=1e-6)
 
 
 def test_brier_of_no_cell_is_no_number():
     none = jnp.zeros((2, 2), bool)
-    assert math.isnan(float(grid.brier(jnp.zeros((2, 2)), none, none)))
+    assert math.isnan(float(brier(jnp.zeros((2, 2)), none, none)))
 
 
 def test_brier_of_an_ignorant_map_is_a_quarter():
     everywhere = jnp.ones((3, 3), bool)
-    assert float(grid.brier(jnp.zeros((3, 3)), jnp.eye(3, dtype=bool), everywhere)) == 0.25
+    assert float(brier(jnp.zeros((3, 3)), jnp.eye(3, dtype=bool), everywhere)) == 0.25
 
 
 def test_calibration_by_hand():
     """Four cells called 3/4, three of them occupied, and one called 1/4 that is occupied: error (0 * 4 + 3/4) / 5."""
     log_odds = jnp.array([math.log(3)] * 4 + [-math.log(3), 0.0]).reshape(2, 3)
     occupied = jnp.array([[True, True, True], [False, True, True]])
-    bins = grid.calibration(log_odds, occupied, log_odds != 0, bins=2)
+    bins = calibration(log_odds, occupied, log_odds != 0, bins=2)
     np.testing.assert_allclose(bins.edges, [0, 0.5, 1])
     np.testing.assert_allclose(bins.cells, [1, 4])
     np.testing.assert_allclose(bins.probability, [0.25, 0.75], rtol=1e-6)
@@ -341,7 +448,7 @@ def test_calibration_is_numpys(tolerance):
     rng = np.random.default_rng(0)
     log_odds, occupied = rng.uniform(-3, 3, (20, 20)), rng.random((20, 20)) < 0.4
     where = rng.random((20, 20)) < 0.7
-    bins = grid.calibration(jnp.array(log_odds), jnp.array(occupied), jnp.array(where), bins=10)
+    bins = calibration(jnp.array(log_odds), jnp.array(occupied), jnp.array(where), bins=10)
     p, o = reference.probability(log_odds)[where], occupied[where]
     counts, _ = np.histogram(p, 10, (0, 1))
     rtol = tolerance(1e-12, 1e-5)
@@ -356,7 +463,7 @@ def test_calibration_is_numpys(tolerance):
 
 def test_certain_cells_fall_into_the_last_bins():
     log_odds = jnp.array([[50.0, -50.0]])
-    bins = grid.calibration(log_odds, jnp.array([[True, False]]), jnp.ones((1, 2), bool), bins=4)
+    bins = calibration(log_odds, jnp.array([[True, False]]), jnp.ones((1, 2), bool), bins=4)
     np.testing.assert_array_equal(bins.cells, [1, 0, 0, 1])
     assert float(bins.error) == pytest.approx(0.0, abs=1e-6)
 

@@ -103,12 +103,21 @@ def test_progress_counts_the_runs_done():
     assert done == [7, 14, 21, 23]
 
 
-@pytest.mark.parametrize(
-    ("name", "runs", "chunk"), [("runs", 0, 8), ("runs", -1, 8), ("runs", 2.5, 8), ("chunk", 5, 0)]
-)
-def test_a_study_of_nothing_is_refused(name, runs, chunk):
-    with pytest.raises(ValueError, match=f"{name}: expected at least 1, a whole number, got"):
-        monte_carlo(one_run, KEY, runs, *ARGS, chunk=chunk)
+@pytest.mark.parametrize("wrong", [0, -1, 2.5, 5.0, True, "5", np.float32(5)])
+@pytest.mark.parametrize("name", ["runs", "chunk"])
+def test_anything_but_a_whole_number_from_one_on_is_refused(name, wrong):
+    numbers = {"runs": 5, "chunk": 5} | {name: wrong}
+    with pytest.raises(ValueError, match=f"^{name}: expected at least 1, a whole number, got {wrong}$"):
+        monte_carlo(one_run, KEY, numbers["runs"], *ARGS, chunk=numbers["chunk"])
+
+
+def test_whole_numbers_may_be_numpy_s():
+    assert monte_carlo(one_run, KEY, np.int64(5), *ARGS, chunk=np.uint8(2)).chunk == 2
+
+
+def test_more_runs_than_an_index_can_count_are_refused():
+    with pytest.raises(ValueError, match=r"^runs: expected at most 2147483647, got 2147483648$"):
+        monte_carlo(one_run, KEY, 2**31, *ARGS)
 
 
 def test_a_study_without_a_device_or_a_key_is_refused():
@@ -116,6 +125,17 @@ def test_a_study_without_a_device_or_a_key_is_refused():
         monte_carlo(one_run, KEY, 5, *ARGS, devices=())
     with pytest.raises(TypeError, match=r"key: expected one made by jax\.random\.key, got 0"):
         monte_carlo(one_run, 0, 5, *ARGS)
+
+
+def test_leaves_of_several_types_add_up_in_their_own_places():
+    def several(key):
+        bits = jax.random.bits(key, (2, 3), jnp.uint8)
+        return {"b": bits, "a": jnp.float16(0.5), "c": (bits > 127, jnp.zeros((0, 4)), jnp.float32(3))}
+
+    value = monte_carlo(several, KEY, 21, chunk=4).value
+    runs = monte_carlo(several, KEY, 21, chunk=4, keep_runs=True).value
+    assert {leaf.dtype.name for leaf in jax.tree.leaves(runs)} >= {"uint8", "float16", "bool", "float32"}
+    jax.tree.map(lambda total, each: np.testing.assert_array_equal(total, each.sum(0, np.float64)), value, runs)
 
 
 def large_count(key):
@@ -161,7 +181,8 @@ SCRIPT = """
     else:
         assert use_all_cores() == len(jax.local_devices()) == {cores}
         assert use_all_cores() == {cores}  # once more changes nothing
-    jax.config.update("jax_enable_x64", True)
+        assert use_all_cores(1) == 1
+    jax.config.update("jax_enable_x64", {x64})
 
     def one_run(key, scale):
         return scale * jnp.cumsum(jax.random.normal(key, (3,)))
@@ -169,15 +190,17 @@ SCRIPT = """
     key, devices = jax.random.key(0), jax.local_devices()
     one = monte_carlo(one_run, key, 13, 2.0, chunk=3, devices=devices[:1])
     every = monte_carlo(one_run, key, 13, 2.0, chunk=3)
-    np.testing.assert_allclose(every.value, one.value, rtol=1e-13)
+    np.testing.assert_array_equal(every.value, one.value)  # to the last bit
+    assert (one.devices, every.devices, every.processes) == (1, len(devices), 1)
     one = monte_carlo(one_run, key, 13, 2.0, chunk=3, keep_runs=True, devices=devices[:1])
     every = monte_carlo(one_run, key, 13, 2.0, chunk=3, keep_runs=True)
     assert every.value.shape == (13, 3)
-    np.testing.assert_allclose(every.value, one.value, rtol=1e-13)
+    np.testing.assert_array_equal(every.value, one.value)
     done = []
     monte_carlo(one_run, key, 13, 2.0, chunk=3, progress=done.append)
     assert done == [min(3 * len(devices) * (i + 1), 13) for i in range(len(done))], done
     assert done[-1] == 13
+    assert monte_carlo(one_run, key, 13, 2.0).chunk == -(-13 // len(devices))  # few runs keep all devices busy
     print(len(devices), "devices")
 """
 
@@ -185,7 +208,7 @@ SCRIPT = """
 @pytest.mark.parametrize("two", [True, False], ids=["two_devices", "all_cores"])
 def test_all_devices_together_give_what_one_gives(two):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    script = textwrap.dedent(SCRIPT.format(two=two, cores=cores))
+    script = textwrap.dedent(SCRIPT.format(two=two, cores=cores, x64=jax.config.jax_enable_x64))
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(Path(__file__).parents[1])}
     environment.pop("XLA_FLAGS", None)
     process = subprocess.run(
@@ -198,4 +221,13 @@ def test_all_devices_together_give_what_one_gives(two):
 def test_asking_for_all_cores_too_late_leaves_the_devices_as_they_are():
     before = jax.local_devices()
     assert use_all_cores() == len(before)
+    assert use_all_cores(len(before)) == len(before)
     assert jax.local_devices() == before
+
+
+def test_more_devices_than_exist_are_refused():
+    there = len(jax.local_devices())
+    with pytest.raises(ValueError, match=rf"^devices: expected at most {there}, the .* machine, got {there + 1}$"):
+        use_all_cores(there + 1)
+    with pytest.raises(ValueError, match=r"^devices: expected at least 1, a whole number, got 0$"):
+        use_all_cores(0)

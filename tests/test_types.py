@@ -1,5 +1,6 @@
 """Records: what they refuse, and with which words; parameters on disk; checks of values and of what is traced."""
 
+import dataclasses
 import json
 import math
 
@@ -166,6 +167,11 @@ def test_a_grid_that_cannot_be_is_refused(change, message):
 def test_settings_that_cannot_be_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         Config(**change)
+
+
+def test_a_gate_that_is_traced_is_not_looked_at():
+    gate = jax.jit(lambda p: dataclasses.replace(Config(), gate_probability=p).gate_probability)
+    assert gate(1.5) == 1.5
 
 
 def test_settings_are_values_equal_hashable_and_frozen():

@@ -1,0 +1,266 @@
+"""A study's finished parts on disk, so that it can go on after any kind of end."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import io
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+_PARTS = 256  # at most: so little of a long study is lost when it dies
+_SYNC_EVERY = 1.0  # s; forcing a file to disk takes milliseconds, a quick study's part less
+_MANIFEST = "manifest.json"
+
+
+class Split(NamedTuple):
+    """A study in chunks, and its chunks in at most 256 parts of (nearly) equal size. No machine plays a role."""
+
+    runs: int
+    chunk: int  # runs
+
+    @property
+    def chunks(self) -> int:
+        """How many; the last may be cut short by the end of the study."""
+        return -(-self.runs // self.chunk)
+
+    @property
+    def parts(self) -> int:
+        """How many."""
+        return min(self.chunks, _PARTS)
+
+    def chunks_of(self, part: int) -> range:
+        """The chunks of a part."""
+        return range(self.chunks * part // self.parts, self.chunks * (part + 1) // self.parts)
+
+    def runs_in(self, chunks: range) -> int:
+        """How many runs are in consecutive chunks."""
+        return min(chunks.stop * self.chunk, self.runs) - chunks.start * self.chunk
+
+    def runs_of(self, part: int) -> int:
+        """How many runs are in a part."""
+        return self.runs_in(self.chunks_of(part))
+
+
+def manifest(split: Split, program: str, key: jax.Array, args: Any, **others: Any) -> dict[str, Any]:
+    """What makes a study what it is, in plain values by name: with the same manifest, parts are the same.
+
+    Args:
+        split: how the runs are divided. program: lowered text of one run, which holds its code, its settings
+            and the shapes of its arguments.
+        key, args: of the study. **others: what else must be the same.
+    """
+    sources = sorted(Path(__file__).parent.rglob("*.py"))
+    return {
+        **split._asdict(),
+        **others,
+        "key": f"{key.dtype} {jax.random.key_data(key).tolist()}",
+        "arguments": _digest(*(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(args))),
+        "program": _digest(program.encode()),
+        "precision": str(jax.dtypes.canonicalize_dtype(float)),
+        "jax": jax.__version__,
+        "jaxlocmap": f"{_version()} {_digest(*(source.read_bytes() for source in sources))}",
+    }
+
+
+def _version() -> str:
+    try:
+        return importlib.metadata.version("jaxlocmap")
+    except importlib.metadata.PackageNotFoundError:  # used from its sources
+        return "not installed"
+
+
+def _digest(*contents: bytes) -> str:
+    return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in contents)).hexdigest()[:16]
+
+
+class Parts:
+    """Where a study keeps its finished parts.
+
+    A part's file is written under another name and then renamed, so it is there whole or not at all. Its checksum
+    spans its numbers, its place and its study: a file that is damaged or from elsewhere is told, and its part done
+    again. Files are forced to disk once a second, so a power cut costs little more than the second before it.
+    """
+
+    def __init__(
+        self,
+        folder: Path | str,
+        settings: Mapping[str, Any] | None = None,
+        *,
+        resume: bool = False,
+        say: Callable[[str], None] = lambda sentence: None,
+    ) -> None:
+        """Nothing is touched before a study starts.
+
+        Args:
+            folder: of one study alone, made if need be. Several processes may share one or have one each.
+            settings: plain values by name that the study was asked for; to go on, they must be the same.
+            resume: go on with the parts that are there. Otherwise they are discarded.
+            say: called with a sentence on what is found, discarded or damaged.
+        """
+        self.folder, self.settings, self.resume, self.say = Path(folder), dict(settings or {}), resume, say
+        self.runs_kept = 0  # in this process's parts
+        self._manifest: dict[str, Any] = {}
+        self._synced = -math.inf
+
+    def recorded_chunk(self) -> int | None:
+        """The chunk of the study that is to go on, if there is one."""
+        return (self._found() or {}).get("chunk") if self.resume else None
+
+    def check(self, manifest: Mapping[str, Any]) -> None:
+        """See whether a study could go on here, and touch nothing.
+
+        Args:
+            manifest: of the study, from the function of that name.
+
+        Raises:
+            ValueError: it should go on, but the folder belongs to another study; every difference is named.
+        """
+        found, asked = self._found(), self._asked(manifest)
+        if self.resume and found is not None and found != asked:
+            names = [name for name in {**found, **asked} if found.get(name) != asked.get(name)]
+            differences = "; ".join(f"{name} was {found.get(name)!r}, is {asked.get(name)!r}" for name in names)
+            raise ValueError(f"resume: expected the study that {self.folder} belongs to, got another: {differences}")
+
+    def open(self, manifest: Mapping[str, Any], parts: Iterable[int]) -> set[int]:
+        """Make the folder ready for a study: discard what is there, unless it is to go on.
+
+        Args:
+            manifest: of the study. parts: numbers of those this process works on.
+
+        Returns:
+            Those of `parts` that are finished and undamaged.
+
+        Raises:
+            ValueError: as `check`. OSError: the folder cannot be read or written.
+        """
+        self.check(manifest)
+        found, asked = self._found(), self._asked(manifest)
+        if not self.resume or found is None:
+            self._discard(found, asked)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._write(_MANIFEST, json.dumps(asked, indent=1).encode())
+        self._manifest = asked
+        whole = {part for part in parts if self._is_whole(part)}
+        self.runs_kept = sum(map(self._split(asked).runs_of, whole))
+        return whole
+
+    def save(self, part: int, arrays: Sequence[np.ndarray]) -> None:
+        """Keep a finished part.
+
+        Raises:
+            OSError: it cannot be written, as on a full disk; what was kept before stays.
+        """
+        contents = io.BytesIO()
+        for array in arrays:
+            np.lib.format.write_array(contents, np.asarray(array), allow_pickle=False)
+        try:
+            self._write(_name(part), self._checksum(part, contents.getvalue()) + contents.getvalue())
+        except OSError as error:
+            raise OSError(
+                f"parts: expected to keep part {part} in {self.folder}, got: {error.strerror}; "
+                f"{self.runs_kept} finished runs are kept there"
+            ) from error
+        self.runs_kept += self._split(self._manifest).runs_of(part)
+
+    def load(self, part: int) -> tuple[np.ndarray, ...]:
+        """The arrays of a finished part.
+
+        Raises:
+            OSError: there is none. ValueError: it is damaged, or not of this study.
+        """
+        whole = (self.folder / _name(part)).read_bytes()
+        checksum, contents = whole[: hashlib.sha256().digest_size], whole[hashlib.sha256().digest_size :]
+        if checksum != self._checksum(part, contents):
+            raise ValueError(f"parts: expected part {part} of this study in {self.folder}, got a damaged file")
+        stream, arrays = io.BytesIO(contents), []
+        while stream.tell() < len(contents):
+            arrays.append(np.lib.format.read_array(stream, allow_pickle=False))
+        return tuple(arrays)
+
+    def clear(self) -> None:
+        """Remove what is kept, and the folder if nothing else is in it: for when the study's report is written."""
+        for pattern in (f"{_name()}*", f"{_MANIFEST}*"):
+            for file in self.folder.glob(pattern):
+                file.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
+
+    def _found(self) -> dict[str, Any] | None:
+        """The manifest in the folder; None if there is none, or none that can be read."""
+        try:
+            found = json.loads((self.folder / _MANIFEST).read_bytes())
+            return found if self._split(found).parts > 0 else None
+        except (FileNotFoundError, ValueError, TypeError, KeyError, ZeroDivisionError):
+            return None
+
+    def _asked(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
+        return json.loads(json.dumps({**self.settings, **manifest}))  # as it will be read again
+
+    @staticmethod
+    def _split(manifest: Mapping[str, Any]) -> Split:
+        return Split(manifest["runs"], manifest["chunk"])
+
+    def _discard(self, found: dict[str, Any] | None, asked: dict[str, Any]) -> None:
+        split, kept = self._split(found or asked), {file.name for file in self.folder.glob(f"{_name()}*")}
+        runs = sum(split.runs_of(part) for part in range(split.parts) if _name(part) in kept)
+        if runs and not self.resume:
+            hint = "resume would have gone on with them" if found == asked else "they belong to another study"
+            self.say(f"discarding {runs:,} finished runs in {self.folder}: {hint}")
+        elif self.resume:
+            damaged = f", {_MANIFEST} is damaged" if (self.folder / _MANIFEST).exists() else ""
+            self.say(f"nothing to resume in {self.folder}{damaged}: starting with the first run")
+        self.clear()
+
+    def _is_whole(self, part: int) -> bool:
+        try:
+            self.load(part)
+        except FileNotFoundError:
+            return False
+        except ValueError:
+            self.say(f"part {part} in {self.folder} is damaged: its runs are done again")
+            return False
+        return True
+
+    def _checksum(self, part: int, contents: bytes) -> bytes:
+        study = json.dumps(self._manifest, sort_keys=True).encode()
+        return hashlib.sha256(hashlib.sha256(study).digest() + part.to_bytes(4, "little") + contents).digest()
+
+    def _write(self, name: str, contents: bytes) -> None:
+        """All of it or nothing, whenever the program or the machine dies."""
+        temporary, sync = self.folder / f"{name}.writing", time.monotonic() > self._synced + _SYNC_EVERY
+        try:
+            with temporary.open("wb") as file:
+                file.write(contents)
+                if sync:
+                    file.flush()
+                    os.fsync(file.fileno())
+            temporary.replace(self.folder / name)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
+        if sync:
+            _sync_folder(self.folder)
+            self._synced = time.monotonic()
+
+
+def _name(part: int | None = None) -> str:
+    return "part-" if part is None else f"part-{part:03d}"
+
+
+def _sync_folder(folder: Path) -> None:
+    with contextlib.suppress(OSError):  # not every file system lets folders be forced to disk
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

@@ -1,0 +1,210 @@
+"""Scoring of a simulated run while it goes on: what is added up, step by step and observation by observation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxlocmap import consistency, grid
+from jaxlocmap.stages import Sighting
+from jaxlocmap.types import Config, Gaussian
+from jaxlocmap.world import World, occupancy
+
+# A run has lost the robot where it is further off than this, and all but excludes that itself. The second half spares
+# a filter that has seen nothing for long and says so.
+_LOST_DISTANCE = 1.0  # m
+_LOST_NEES = consistency.chi2_quantile(1 - 1e-6, consistency.POSE_DIMENSION)
+
+
+class MapTotals(NamedTuple):
+    """Of the map at the end of a run, scored on the cells it has seen."""
+
+    entropy_bits: jax.Array  # ()
+    brier: jax.Array  # (), 0 for a run that has seen no cell
+    scored: jax.Array  # () 1 if the run has seen any cell
+    cells: jax.Array  # (bins,) cells by the probability the map gives them
+    probability: jax.Array  # (bins,) sum of those probabilities
+    occupied: jax.Array  # (bins,) how many of those cells are occupied
+
+
+class Totals(NamedTuple):
+    """What a run adds to a study. Every entry is a sum, over steps or observations, then over runs."""
+
+    runs: jax.Array  # ()
+    scored_runs: jax.Array  # () runs with any step scored
+    scored: jax.Array  # (T,) steps whose NEES is finite and not negative
+    nees: jax.Array  # (T,)
+    error_square: tuple[jax.Array, ...]  # x, y, yaw: (T,) each, m², m², rad²
+    variance: tuple[jax.Array, ...]  # the same of the filter's own
+    axis_nees: jax.Array  # (3,) of each axis alone, error² / σ²
+    within_two_sigma: jax.Array  # (3,)
+    covered: jax.Array  # (levels,) steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
+    run_nees: jax.Array  # (2,) the run's average NEES, and its square
+    run_nis: jax.Array  # (2,) the run's average NIS, and its square
+    observing_runs: jax.Array  # () runs with any observation scored
+    observed: jax.Array  # (T,) observations whose NIS is finite
+    unscored_observations: jax.Array  # () the others: a reading or a belief that is no number
+    nis: jax.Array  # (T,)
+    accepted: jax.Array  # (T,)
+    lag_products: jax.Array  # (2,) range, bearing
+    lag_squares: jax.Array  # (2,)
+    lag_pairs: jax.Array  # ()
+    flagged_steps: jax.Array  # () steps whose `Info.ok` is False
+    diverged: jax.Array  # () 1 if the run lost the robot at any step, or ended without a finite belief
+    map: MapTotals | None
+
+
+class StepTally(NamedTuple):
+    """What a run adds up of its steps; at one step, of that step."""
+
+    scored: jax.Array  # ()
+    nees: jax.Array  # ()
+    axis_nees: jax.Array  # (3,)
+    within_two_sigma: jax.Array  # (3,)
+    covered: jax.Array  # (levels,)
+    flagged: jax.Array  # ()
+    lost: jax.Array  # ()
+
+
+class SightingTally(NamedTuple):
+    """What a run adds up of its observations; at one step, of that step."""
+
+    observed: jax.Array  # ()
+    nis: jax.Array  # ()
+    accepted: jax.Array  # ()
+    unscored: jax.Array  # ()
+    unusable: jax.Array  # ()
+    lag_products: jax.Array  # (2,)
+    lag_squares: jax.Array  # (2,)
+    lag_pairs: jax.Array  # ()
+
+
+class Latest(NamedTuple):
+    """The last observation of each landmark."""
+
+    seen: jax.Array  # (L,) bool: there was one
+    white: tuple[jax.Array, jax.Array]  # (L,) each: its innovation, whitened
+
+
+class Kept(NamedTuple):
+    """What is kept of each step: the fields of `Totals` of the same name."""
+
+    scored: jax.Array
+    nees: jax.Array
+    error_square: tuple[jax.Array, ...]
+    variance: tuple[jax.Array, ...]
+    observed: jax.Array
+    nis: jax.Array
+    accepted: jax.Array
+
+
+def no_steps(zero: jax.Array) -> StepTally:
+    """The tally before the first step. zero: () of the dtype to count in."""
+    three, levels = jnp.full(3, zero), jnp.full(len(consistency.COVERAGE_LEVELS), zero)
+    return StepTally(zero, zero, three, three, levels, zero, zero)
+
+
+def no_sightings(zero: jax.Array) -> SightingTally:
+    """The tally before the first observation. zero: () of the dtype to count in."""
+    pair = jnp.full(2, zero)
+    return SightingTally(zero, zero, zero, zero, zero, pair, pair, zero)
+
+
+def score_step(
+    belief: Gaussian, truth: jax.Array, ok: jax.Array
+) -> tuple[StepTally, tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+    """The tally of one step, and its squared error and variance along x, y, yaw."""
+    dtype = truth.dtype
+    error = consistency.pose_error(truth, belief.mean)
+    nees = consistency.nees(error, belief.cov)
+    scored = jnp.isfinite(nees) & (nees >= 0)  # below zero the covariance is none
+    nees = jnp.where(scored, nees, 0)
+    squares = [jnp.where(scored, error[i] ** 2, 0) for i in range(3)]
+    variances = [jnp.where(scored, belief.cov[i, i], 0) for i in range(3)]
+    ratios = [jnp.where(scored, square / belief.cov[i, i], 0) for i, square in enumerate(squares)]
+    quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
+    lost = (squares[0] + squares[1] > _LOST_DISTANCE**2) & (nees > _LOST_NEES)
+    tally = StepTally(
+        scored=scored.astype(dtype),
+        nees=nees,
+        axis_nees=jnp.stack(ratios),
+        within_two_sigma=jnp.stack([(scored & (ratio <= 4)).astype(dtype) for ratio in ratios]),
+        covered=jnp.stack([(scored & (nees < quantile)).astype(dtype) for quantile in quantiles]),
+        flagged=(~ok).astype(dtype),
+        lost=lost.astype(dtype),
+    )
+    return tally, tuple(squares), tuple(variances)
+
+
+def score_sighting(
+    sighting: Sighting, valid: jax.Array, used: jax.Array, latest: Latest
+) -> tuple[SightingTally, Latest]:
+    """The tally of one observation of one landmark, and what the next one is to be compared with."""
+    dtype = sighting.nis.dtype
+    white = consistency.whiten(sighting.innovation, sighting.S)
+    # What the filter could not use has S zero; where the belief has broken down, nothing whitens to a number.
+    measured = (sighting.S[0, 0] > 0) & jnp.isfinite(white[0] + white[1])
+    paired = measured & latest.seen
+    tally = SightingTally(
+        observed=measured.astype(dtype),
+        nis=jnp.where(measured, sighting.nis, 0),
+        accepted=sighting.accepted.astype(dtype),
+        unscored=(valid & ~measured).astype(dtype),
+        unusable=(valid & ~used).astype(dtype),
+        lag_products=jnp.stack([jnp.where(paired, white[i] * latest.white[i], 0) for i in range(2)]),
+        lag_squares=jnp.stack([jnp.where(paired, white[i] ** 2, 0) for i in range(2)]),
+        lag_pairs=paired.astype(dtype),
+    )
+    first, second = (jnp.where(measured, white[i], latest.white[i]) for i in range(2))
+    return tally, Latest(latest.seen | measured, (first, second))
+
+
+def run_totals(
+    kept: Kept,
+    steps: StepTally,
+    sightings: SightingTally,
+    truth: jax.Array,
+    belief: Gaussian,
+    of_map: MapTotals | None,
+) -> Totals:
+    """What one run adds to a study."""
+    dtype = steps.nees.dtype
+    run_nees = steps.nees / jnp.maximum(steps.scored, 1)
+    run_nis = sightings.nis / jnp.maximum(sightings.observed, 1)
+    ended = jnp.all(jnp.isfinite(truth - belief.mean)) & jnp.all(jnp.isfinite(jnp.diagonal(belief.cov)))
+    return Totals(
+        **kept._asdict(),
+        runs=jnp.ones((), dtype),
+        scored_runs=(steps.scored > 0).astype(dtype),
+        axis_nees=steps.axis_nees,
+        within_two_sigma=steps.within_two_sigma,
+        covered=steps.covered,
+        run_nees=jnp.stack([run_nees, run_nees**2]),
+        run_nis=jnp.stack([run_nis, run_nis**2]),
+        observing_runs=(sightings.observed > 0).astype(dtype),
+        unscored_observations=sightings.unscored,
+        lag_products=sightings.lag_products,
+        lag_squares=sightings.lag_squares,
+        lag_pairs=sightings.lag_pairs,
+        flagged_steps=steps.flagged,
+        diverged=((steps.lost > 0) | ~ended).astype(dtype),
+        map=of_map,
+    )
+
+
+def map_totals(log_odds: jax.Array | None, world: World, config: Config) -> MapTotals | None:
+    """The final map (rows, columns) against the world it is of; None without a map."""
+    if log_odds is None or config.grid is None:
+        return None
+    occupied, seen = occupancy(world, config.grid), log_odds != 0
+    bins, scored = grid.calibration(log_odds, occupied, seen), jnp.any(seen)
+    return MapTotals(
+        entropy_bits=grid.entropy_bits(log_odds),
+        brier=jnp.where(scored, grid.brier(log_odds, occupied, seen), 0),
+        scored=scored.astype(log_odds.dtype),
+        cells=bins.cells,
+        probability=jnp.nan_to_num(bins.probability * bins.cells),
+        occupied=jnp.nan_to_num(bins.frequency * bins.cells),
+    )

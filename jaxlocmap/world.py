@@ -1,0 +1,93 @@
+"""What stands around a robot: walls and landmarks, what a laser sees of them, and the map they ought to give."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxlocmap.batching import zero_like_any
+from jaxlocmap.trig import sin_cos
+from jaxlocmap.types import GridSpec
+
+
+class World(NamedTuple):
+    """What stands around the robot."""
+
+    segments: jax.Array  # (S, 2, 2) m: walls, from point to point
+    landmarks: jax.Array  # (L, 2) m
+
+
+def room() -> World:
+    """A room of 12 x 12 m with one box in it and four landmarks."""
+    corners = [
+        [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)],
+        [(4.5, 4.0), (7.5, 4.0), (7.5, 6.5), (4.5, 6.5)],
+    ]
+    walls = [(ring[i], ring[(i + 1) % 4]) for ring in corners for i in range(4)]
+    return World(
+        segments=jnp.array(walls),
+        landmarks=jnp.array([[2.0, 10.0], [10.0, 2.5], [9.5, 10.5], [2.0, 5.5]]),
+    )
+
+
+def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_range: float) -> jax.Array:
+    """Distance along each beam to the nearest wall, `max_range` where there is none.
+
+    Args:
+        pose: (3,) m, m, rad. beam_angles: (B,) rad, body frame. segments: (S, 2, 2) m.
+
+    Returns:
+        (B,) m.
+    """
+    sin, cos = sin_cos(pose[2])
+    table_cos, table_sin = jnp.cos(beam_angles), jnp.sin(beam_angles)
+    dx, dy = cos * table_cos - sin * table_sin, sin * table_cos + cos * table_sin
+
+    def nearer(nearest: jax.Array, segment: jax.Array) -> tuple[jax.Array, None]:
+        # pose + t d = a + s wall, by Cramer's rule
+        wall_x, wall_y = segment[1, 0] - segment[0, 0], segment[1, 1] - segment[0, 1]
+        away_x, away_y = pose[0] - segment[0, 0], pose[1] - segment[0, 1]
+        det = dx * wall_y - dy * wall_x
+        across = 1 / jnp.where(jnp.abs(det) < 1e-9, 1, det)  # a beam along the wall does not hit it
+        s = (dx * away_y - dy * away_x) * across
+        t = (wall_x * away_y - wall_y * away_x) * across
+        hits = (jnp.abs(det) >= 1e-9) & (s >= 0) & (s <= 1) & (t >= 0)
+        return jnp.where(hits, jnp.minimum(nearest, t), nearest), None
+
+    # Beams side by side, wall after wall: a minimum over a short last axis would not be vector code.
+    zero = zero_like_any(pose, beam_angles, segments)
+    far = jnp.full(dx.shape, max_range, dx.dtype) + zero.astype(dx.dtype)
+    return jax.lax.scan(nearer, far, segments, unroll=8)[0]
+
+
+def occupancy(world: World, spec: GridSpec) -> jax.Array:
+    """The true map: the cells a wall runs through. A wall along the edge of two cells occupies both.
+
+    Returns:
+        (rows, columns) bool.
+    """
+    rows, columns = spec.shape
+    dtype = world.segments.dtype
+    reach = spec.resolution * 1e-3  # a wall on the edge must not depend on rounding
+    low_x = spec.origin[0] + spec.resolution * jnp.arange(columns, dtype=dtype)[None, :] - reach
+    low_y = spec.origin[1] + spec.resolution * jnp.arange(rows, dtype=dtype)[:, None] - reach
+    size = spec.resolution + 2 * reach
+
+    def with_wall(occupied: jax.Array, segment: jax.Array) -> tuple[jax.Array, None]:
+        enter, leave = jnp.zeros((), dtype), jnp.ones((), dtype)
+        # Clip the wall against every cell, one axis after the other (Liang & Barsky 1984).
+        for axis, low in ((0, low_x), (1, low_y)):
+            near, step = low - segment[0, axis], segment[1, axis] - segment[0, axis]
+            far = near + size
+            share = 1 / jnp.where(step != 0, step, 1)
+            across = jnp.broadcast_to(step != 0, near.shape)
+            between = (near <= 0) & (far >= 0)
+            first, last = jnp.minimum(near * share, far * share), jnp.maximum(near * share, far * share)
+            enter = jnp.maximum(enter, jnp.where(across, first, jnp.where(between, 0, jnp.inf)))
+            leave = jnp.minimum(leave, jnp.where(across, last, jnp.where(between, 1, -jnp.inf)))
+        return occupied | (enter <= leave), None
+
+    nothing = jnp.full(spec.shape, zero_like_any(world.segments) != 0)
+    return jax.lax.scan(with_wall, nothing, world.segments)[0]

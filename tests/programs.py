@@ -1,0 +1,56 @@
+"""Programs in processes of their own, and what they leave behind."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent
+WALKS = Path(__file__).parent / "walks.py"
+# What a report says of the computing and not of the study.
+COMPUTING = {"devices", "processes", "resumed_runs", "wall_s", "compile_s", "run_s", "runs_per_s"}
+
+
+def start(file, *arguments, **environment):
+    """Start a program as from a command line."""
+    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "XLA_FLAGS"))}
+    paths = {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "experiments")))}
+    return subprocess.Popen(
+        [sys.executable, str(file), *map(str, arguments)],
+        env={**inherited, "JAX_PLATFORMS": "cpu", **paths, **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ended(process):
+    """Its exit status and what it said."""
+    try:
+        out, err = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    # The library that processes talk through says so.
+    return process.returncode, "".join(line for line in out.splitlines(True) if not line.startswith("[Gloo]")), err
+
+
+def report(folder):
+    return json.loads((folder / "report.json").read_text())
+
+
+def result(folder):
+    """The report without what is different each time."""
+    return {name: value for name, value in report(folder).items() if name not in COMPUTING}
+
+
+def is_free(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) != 0
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

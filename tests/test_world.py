@@ -1,0 +1,136 @@
+"""Walls seen by a laser, against the reference, NumPy and rooms worked by hand, and the map they ought to give."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+from jaxlocmap import GridSpec, world
+from jaxlocmap.world import World, room
+
+occupancy = jax.jit(world.occupancy, static_argnums=1)
+ray_cast = jax.jit(world.ray_cast)
+
+
+def test_the_room_is_the_course_s():
+    here = room()
+    np.testing.assert_allclose(here.landmarks, reference.COURSE_LANDMARKS)
+    expected = [(ring[i], ring[(i + 1) % 4]) for ring in reference.COURSE_WALLS for i in range(4)]
+    np.testing.assert_allclose(here.segments, expected)
+
+
+# --- What a laser sees ---
+
+
+@pytest.mark.parametrize("pose", [(1.0, 1.0, 0.0), (9.0, 5.4, 2.0), (6.0, 5.0, -3.0), (0.3, 11.7, 3.1)])
+def test_ray_casting_is_the_reference_s(pose, tolerance):
+    expected = reference.course_ranges(np.array(pose), np.zeros(61))
+    got = ray_cast(jnp.array(pose), jnp.array(reference.COURSE_ANGLES), room().segments, 8.0)
+    np.testing.assert_allclose(np.maximum(got, 0.05), expected, rtol=0, atol=tolerance(1e-12, 1e-4))
+
+
+def nearest_hit(pose, angle, walls, max_range):
+    """Where a beam first meets a wall: pose + t d = a + s (b - a), solved for t and s wall by wall."""
+    heading, hits = pose[2] + angle, [max_range]
+    for a, b in walls:
+        directions = np.column_stack([[np.cos(heading), np.sin(heading)], a - b])
+        t, s = np.linalg.solve(directions, a - pose[:2])
+        if t >= 0 and 0 <= s <= 1:
+            hits.append(t)
+    return min(hits)
+
+
+@pytest.mark.parametrize("walls", [1, 7, 8, 9, 20])
+def test_ray_casting_among_random_walls_is_a_linear_system_a_wall(walls, tolerance):
+    """Behind the robot, beyond the reach, one behind another; however many a turn of the loop takes at once."""
+    rng = np.random.default_rng(walls)
+    segments, angles = rng.uniform(-5, 5, (walls, 2, 2)), rng.uniform(-np.pi, np.pi, 12)
+    poses = np.column_stack([rng.uniform(-3, 3, (6, 2)), rng.uniform(-np.pi, np.pi, 6)])
+    got = jax.vmap(ray_cast, in_axes=(0, None, None, None))(*map(jnp.array, (poses, angles, segments)), 4.0)
+    expected = [[nearest_hit(pose, angle, segments, 4.0) for angle in angles] for pose in poses]
+    off = np.abs(got - np.array(expected)) > tolerance(1e-9, 1e-3)  # where a beam all but runs along a wall
+    assert np.mean(off) <= tolerance(0, 0.02)  # float32: a beam past an end may meet another wall
+
+
+def test_ray_casting_in_a_room_worked_by_hand():
+    # A square of 4 m with a short wall from (3, 1) to (3, 1.5) in it; the robot at (1, 1) looks along +x.
+    corners = [(0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0)]
+    walls = [(corners[i], corners[(i + 1) % 4]) for i in range(4)] + [((3.0, 1.0), (3.0, 1.5))]
+    angles = np.deg2rad([0.0, 45.0, 90.0, 180.0, -90.0, np.rad2deg(np.arctan2(0.25, 2.0)), -5.0])
+    exact = [2.0, 3 * np.sqrt(2), 3.0, 1.0, 1.0, np.hypot(2, 0.25), 3 / np.cos(np.deg2rad(5))]
+    cast = functools.partial(ray_cast, beam_angles=jnp.array(angles), segments=jnp.array(walls))
+    np.testing.assert_allclose(cast(jnp.array([1.0, 1.0, 0.0]), max_range=10.0), exact, rtol=1e-5)
+    np.testing.assert_allclose(cast(jnp.array([1.0, 1.0, 0.0]), max_range=2.5), np.minimum(exact, 2.5), rtol=1e-5)
+    # The same robot turned by 90 degrees sees to the left what was ahead.
+    turned = ray_cast(jnp.array([1.0, 1.0, np.pi / 2]), jnp.array(angles) - np.pi / 2, jnp.array(walls), 10.0)
+    np.testing.assert_allclose(turned, exact, rtol=1e-5)
+
+
+def test_a_beam_along_a_wall_and_a_world_without_walls_hit_nothing():
+    along = jnp.array([[[2.0, 1.0], [3.0, 1.0]]])
+    pose, ahead = jnp.array([1.0, 1.0, 0.0]), jnp.array([0.0])
+    assert ray_cast(pose, ahead, along, 8.0) == 8.0
+    assert ray_cast(pose, ahead, jnp.zeros((0, 2, 2)), 8.0) == 8.0
+
+
+# --- The true map ---
+
+
+def drawn(cells):
+    """The map as a picture of lines, highest y first."""
+    return ["".join(".#"[int(cell)] for cell in row) for row in np.asarray(cells)[::-1]]
+
+
+def occupied_by(*walls, origin=(0.0, 0.0), shape=(4, 5), resolution=1.0):
+    here = World(jnp.array(walls, float), jnp.zeros((0, 2)))
+    return drawn(occupancy(here, GridSpec(origin, resolution, shape)))
+
+
+def test_a_wall_occupies_the_cells_it_runs_through():
+    assert occupied_by([(0.5, 1.5), (3.5, 1.5)]) == [".....", ".....", "####.", "....."]
+    assert occupied_by([(2.5, 3.7), (2.5, 2.2)]) == ["..#..", "..#..", ".....", "....."]
+
+
+def test_a_slanted_wall_occupies_every_cell_it_cuts():
+    # From (0.5, 0.5) to (2.5, 1.5): crosses x = 1 at y = 0.75, y = 1 at x = 1.5, x = 2 at y = 1.25.
+    assert occupied_by([(0.5, 0.5), (2.5, 1.5)]) == [".....", ".....", ".##..", "##..."]
+    assert occupied_by([(2.5, 1.5), (0.5, 0.5)]) == [".....", ".....", ".##..", "##..."]
+
+
+def test_a_diagonal_through_corners_occupies_the_cells_that_touch_them():
+    assert occupied_by([(0.5, 0.5), (2.5, 2.5)]) == [".....", ".##..", "###..", "##..."]
+
+
+def test_a_wall_on_the_edge_of_two_cells_occupies_both():
+    assert occupied_by([(0.5, 2.0), (1.5, 2.0)]) == [".....", "##...", "##...", "....."]
+    assert occupied_by([(3.0, 0.5), (3.0, 0.6)]) == [".....", ".....", ".....", "..##."]
+
+
+@pytest.mark.parametrize("resolution", [0.2, 0.1, 0.05])
+def test_a_wall_on_an_edge_does_not_depend_on_rounding(resolution):
+    # 0.2 and its multiples are no binary fractions: computed edges miss the wall by a rounding error.
+    count = round(2 / resolution)
+    for column in range(1, count):
+        here = World(jnp.array([[(column * resolution, 0.31), (column * resolution, 0.33)]]), jnp.zeros((0, 2)))
+        cells = np.asarray(occupancy(here, GridSpec((0.0, 0.0), resolution, (count, count))))
+        assert np.flatnonzero(cells.any(axis=0)).tolist() == [column - 1, column]
+
+
+def test_a_wall_outside_or_past_the_map_occupies_what_lies_on_it():
+    assert occupied_by([(-3.0, -1.0), (9.0, -1.0)]) == ["....."] * 4
+    assert occupied_by([(-3.0, 2.5), (9.0, 2.5)]) == [".....", "#####", ".....", "....."]
+    assert occupied_by([(6.0, 0.0), (6.0, 3.0)]) == ["....."] * 4
+
+
+def test_the_grid_s_origin_and_shape_place_the_walls():
+    wall = [(-9.5, 21.5), (-8.5, 21.5)]
+    assert occupied_by(wall, origin=(-10.0, 20.0), shape=(2, 4)) == ["##..", "...."]
+
+
+def test_a_point_is_a_wall_and_no_wall_is_an_empty_map():
+    assert occupied_by([(1.5, 1.5), (1.5, 1.5)]) == [".....", ".....", ".#...", "....."]
+    here = World(jnp.zeros((0, 2, 2)), jnp.zeros((0, 2)))
+    assert not np.any(occupancy(here, GridSpec((0.0, 0.0), 1.0, (4, 5))))
