@@ -34,17 +34,17 @@ def gate_threshold(probability: float | jax.Array | None, dimension: int) -> Any
     """Quantile of χ² with `dimension` degrees: a good observation's distance stays below it with `probability`.
 
     Args:
-        probability: inside (0, 1), or None for no gate. With two degrees it may also be a traced value, up to 1 for no
-            gate: -2 log(1 - p).
+        probability: inside (0, 1), or None for no gate. With two degrees it may also be an array, up to 1 for no gate:
+            -2 log(1 - p).
 
     Raises:
-        ValueError: a number outside (0, 1), or a traced one with other than two degrees.
+        ValueError: a number outside (0, 1), or an array with other than two degrees.
     """
     if probability is None:
         return float("inf")
-    if not checks.is_concrete(probability):
+    if isinstance(probability, jax.Array):
         if dimension != 2:
-            raise ValueError(f"gate probability: expected a number for {dimension} degrees, got a traced value")
+            raise ValueError(f"gate probability: expected a number for {dimension} degrees, got an array")
         return -2 * jnp.log1p(-probability)
     if not 0 < probability < 1:
         raise ValueError(f"gate probability: expected a value inside (0, 1), got {probability}")
@@ -128,7 +128,7 @@ def update(
     r = tuple(residual[i] for i in range(m))
     S = sandwich(H, P) + noise
     L, D = ldl(S)
-    definite = functools.reduce(jnp.logical_and, [d > 0 for d in D])
+    definite = functools.reduce(jnp.logical_and, [(d > 0) & (d < jnp.inf) for d in D])
     distance: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
     nis = jnp.where(definite, distance, jnp.nan)
     log_det = sum(jnp.log(d) for d in D)

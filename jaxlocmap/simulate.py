@@ -225,7 +225,8 @@ def look_round(draws: jax.Array, pose: jax.Array, world: World, noise: Noise, *,
     Args:
         draws: (B,) standard normals. pose: (3,) m, m, rad, the true one. world, noise: as their fields say.
     """
-    exact = ray_cast(pose, scenario.beam_angles(), world.segments, scenario.max_range)
+    angles = scenario.beam_angles().astype(pose.dtype)
+    exact = ray_cast(pose, angles, world.segments, scenario.max_range)
     return jnp.maximum(exact + draws * noise.scan, scenario.min_range)
 
 

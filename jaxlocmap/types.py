@@ -161,7 +161,7 @@ class Config:
         _freeze_tuples(self, "sensor_offset")
         for name in ("dt", "min_range", "max_range"):
             checks.number(name, getattr(self, name))
-        gate = self.gate_probability if checks.is_concrete(self.gate_probability) else None
+        gate = None if isinstance(self.gate_probability, jax.Array) else self.gate_probability
         if gate is not None:
             checks.number("gate_probability", gate)
         if not (math.isfinite(self.dt) and self.dt > 0):

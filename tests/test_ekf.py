@@ -111,7 +111,7 @@ def test_a_traced_gate_is_the_same_quantile_and_one_of_1_is_none(tolerance):
 
 
 def test_a_traced_gate_is_for_two_dimensions():
-    with pytest.raises(ValueError, match="gate probability: expected a number for 3 degrees, got a traced value"):
+    with pytest.raises(ValueError, match="gate probability: expected a number for 3 degrees, got an array"):
         jax.eval_shape(lambda p: ekf.gate_threshold(p, 3), 0.9)
 
 

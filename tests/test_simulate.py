@@ -140,47 +140,50 @@ def test_the_loop_keeps_half_a_metre_from_every_wall_and_comes_back(loops):
 # --- Randomness ---
 
 
-def test_the_same_key_gives_the_same_numbers_and_another_key_others():
-    start = jnp.array(SHORT.start)
-    first, again, other = (
-        simulated(jax.random.key(seed), room(), Noise(), start, scenario=SHORT) for seed in (3, 3, 4)
+@functools.partial(jax.jit, static_argnames="scenario")
+def three(keys, worlds, noises, starts, *, scenario):
+    """Three drives at once that share nothing."""
+    return jax.vmap(functools.partial(simulate.simulate, scenario=scenario))(keys, worlds, noises, starts)
+
+
+def settings_of_three():
+    """Keys, worlds, noises and starts."""
+    return (
+        jax.random.split(jax.random.key(0), 3),
+        jax.tree.map(lambda x: jnp.stack([x, x * 1.5, x * 0.9]), room()),
+        jax.tree.map(lambda std: jnp.array([1.0, 2.0, 0.5]) * std, Noise()),
+        jnp.array([SHORT.start, (2.0, 3.0, 1.0), (1.5, 1.2, -0.3)]),
     )
-    jax.tree.map(np.testing.assert_array_equal, first, again)
-    assert not np.any(first[0].pose[:, 2] == other[0].pose[:, 2])
-    assert not np.any(first[1].control == other[1].control)
-    both = np.asarray(first[1].valid & other[1].valid)
-    assert both.any()
-    assert not np.any(np.asarray(first[1].z)[both] == np.asarray(other[1].z)[both])
-    assert not np.any(first[1].ranges == other[1].ranges)
 
 
 def test_a_batch_of_keys_worlds_noises_and_starts_is_a_python_loop(tolerance):
-    batch = (
-        jax.random.split(jax.random.key(0), 2),
-        jax.tree.map(lambda x: jnp.stack([x, x * 1.5]), room()),
-        jax.tree.map(lambda std: jnp.array([1.0, 2.0]) * std, Noise()),
-        jnp.array([SHORT.start, (2.0, 3.0, 1.0)]),
-    )
-    both = jax.jit(jax.vmap(functools.partial(simulate.simulate, scenario=SHORT)))(*batch)
-    for i in range(2):
+    batch = settings_of_three()
+    together = three(*batch, scenario=SHORT)
+    for i in range(3):
         alone = simulated(*jax.tree.map(lambda x, i=i: x[i], batch), scenario=SHORT)
         jax.tree.map(
-            lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=0, atol=tolerance(1e-12, 1e-5)), alone, both
+            lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=0, atol=tolerance(1e-12, 1e-5)), alone, together
         )
 
 
-def test_a_drive_does_not_depend_on_its_company():
-    """Bit for bit, whoever else is in the batch, and wherever in it."""
-    keys = jax.random.split(jax.random.key(5), 5)
-    starts = draw_poses(keys, LOOP.prior())
+def test_a_drive_depends_on_its_key_and_not_on_its_company():
+    """Bit for bit, whoever else is in the batch, and wherever in it; and with another key it is another."""
 
-    def batch(*chosen):
-        chosen = jnp.array(chosen)
-        return simulated_by_key_and_start(keys[chosen], room(), Noise(), starts[chosen], scenario=SHORT, scan=True)
+    def batch(*chosen, keys=None):
+        settings = jax.tree.map(lambda x: x[jnp.array(chosen)], settings_of_three())
+        return three(*settings if keys is None else (keys, *settings[1:]), scenario=SHORT)
 
-    among_some, among_others = batch(2, 0, 1), batch(4, 3, 2)
-    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y[2]), among_some, among_others)
-    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[0], y[0]), batch(2, 2, 2), among_some)
+    first, second = batch(0, 1, 2), batch(2, 0, 0)
+    for i, j in ((0, 1), (0, 2), (2, 0)):
+        jax.tree.map(lambda x, y, i=i, j=j: np.testing.assert_array_equal(x[i], y[j]), first, second)
+    truth, inputs = batch(0, 0, 0, keys=jax.random.split(jax.random.key(1), 3))
+    for one, other in itertools.combinations(range(3), 2):
+        assert not np.any(truth.pose[one, :, 2] == truth.pose[other, :, 2])
+        assert not np.any(inputs.control[one] == inputs.control[other])
+        both = np.asarray(inputs.valid[one] & inputs.valid[other])
+        assert both.any()
+        assert not np.any(np.asarray(inputs.z[one])[both] == np.asarray(inputs.z[other])[both])
+        assert not np.any(inputs.ranges[one] == inputs.ranges[other])
 
 
 def test_neither_compiling_nor_leaving_out_the_scanner_changes_the_drive(tolerance):
@@ -197,12 +200,11 @@ def test_neither_compiling_nor_leaving_out_the_scanner_changes_the_drive(toleran
 
 @pytest.mark.usefixtures("x64")
 def test_a_drive_is_the_same_in_both_precisions():
-    world, noise = room(), jax.tree.map(jnp.asarray, Noise())
-    double = simulated(jax.random.key(1), world, noise, jnp.array(SHORT.start), scenario=SHORT, scan=False)
-    world, noise = jax.tree.map(lambda x: x.astype(jnp.float32), (world, noise))
-    start = jnp.array(SHORT.start, jnp.float32)
-    single = simulated(jax.random.key(1), world, noise, start, scenario=SHORT, scan=False)
-    assert {x.dtype for x in jax.tree.leaves(single)} == {jnp.dtype(d) for d in (jnp.float32, jnp.int32, bool)}
+    key, *args = (jax.random.key(1), room(), jax.tree.map(jnp.asarray, Noise()), jnp.array(SHORT.start))
+    double = simulated(key, *args, scenario=SHORT)
+    single = simulated(key, *jax.tree.map(lambda x: x.astype(jnp.float32), args), scenario=SHORT)
+    floats = [x.dtype for x in jax.tree.leaves(single) if jnp.issubdtype(x.dtype, jnp.floating)]
+    assert set(floats) == {jnp.dtype(jnp.float32)}
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-5), single, double)
 
 
@@ -216,7 +218,7 @@ def test_no_two_uses_of_a_step_share_a_random_number(monkeypatch):
         return counter
 
     monkeypatch.setattr(normals, "threefry", recording)
-    words, scenario = normals.words_of(jax.random.key(0)), dataclasses.replace(CAPSTONE, outliers=True)
+    words, scenario = (0, 0), dataclasses.replace(CAPSTONE, outliers=True)
     for k in (0, 1, 2**20, 2**30):
         simulate.draw_drive(words, k, float)
         for j in range(30):
@@ -248,7 +250,7 @@ def test_the_true_start_s_heading_is_wrapped():
 # --- Sensors ---
 
 
-def test_the_noise_of_drive_and_sensors_is_what_the_equations_say(capstones):
+def test_the_noise_of_drive_and_sensors_is_what_the_equations_say(capstones, tolerance):
     """Every disturbance, divided by its deviation, is standard normal, and new at every step and in every run."""
     truth, inputs = capstones
     poses, noise = np.asarray(truth.pose, np.float64), Noise()
@@ -290,9 +292,9 @@ def test_the_noise_of_drive_and_sensors_is_what_the_equations_say(capstones):
     exact = np.stack([cast(pose) for pose in truth.pose[run]])
     scan = (np.asarray(inputs.ranges[run]) - exact) / noise.scan
     clear = exact > 0.5  # a reading is never below the least range
-    # In float32 a ray past a corner may meet another wall here than in the simulation.
-    clear &= np.abs(scan) < 6
-    assert np.mean(clear) > 0.99
+    strayed = clear & (np.abs(scan) > 6)  # in float32 a ray past a corner may meet another wall here than there
+    assert np.mean(strayed) <= tolerance(0, 1e-3)
+    clear &= ~strayed
     assert_standard_normal(scan[clear])
     for one, other in (
         (np.s_[:, :-1], np.s_[:, 1:]),
@@ -374,7 +376,7 @@ def test_the_share_of_false_sightings_is_the_rate(rate):
     """Of a landmark out of reach only the false ones are reported; of one in reach the true ones are as ever."""
     count, noise = 20_000, Noise(outlier_rate=rate)
     bound = scipy.stats.norm.isf(FAILURE / 2) * np.sqrt(count * rate * (1 - rate))
-    _, valid = sighted(jnp.array(20.0), noise, scenario=FALSE, count=count)
+    _, valid = map(np.asarray, sighted(jnp.array(20.0), noise, scenario=FALSE, count=count))
     assert abs(np.sum(valid) - count * rate) <= bound
     (z, valid), (honest, _) = (
         map(np.asarray, sighted(jnp.array(3.0), noise, scenario=scenario, count=count)) for scenario in (FALSE, SHORT)
@@ -388,21 +390,21 @@ def test_the_share_of_false_sightings_is_the_rate(rate):
 
 
 def test_false_sightings_change_neither_the_drive_nor_what_is_true():
-    keys = jax.random.split(jax.random.key(2), 50)
-    starts = jnp.tile(jnp.array(SHORT.start), (50, 1))
-    (truth, honest), (same_truth, some_false), (_, without) = (
+    keys, worlds, noises, starts = settings_of_three()
+    (truth, honest), (same_truth, some_false), (_, none_false) = (
         jax.tree.map(
             np.asarray,
-            simulated_by_key_and_start(keys, room(), Noise(outlier_rate=rate), starts, scenario=scenario, scan=False),
+            three(keys, worlds, noises._replace(outlier_rate=jnp.full(3, rate)), starts, scenario=scenario),
         )
         for scenario, rate in ((SHORT, 0.5), (FALSE, 0.5), (FALSE, 0.0))
     )
-    np.testing.assert_array_equal(truth.pose, same_truth.pose)
-    np.testing.assert_array_equal(honest.control, some_false.control)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=1e-6), honest, without)
+    close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-5)
+    jax.tree.map(close, (truth, honest.control, honest.ranges), (same_truth, some_false.control, some_false.ranges))
+    jax.tree.map(close, honest, none_false)
     looks = np.arange(SHORT.steps) % SHORT.sight_period == 0
     assert not some_false.valid[:, ~looks].any()
-    both = honest.valid & some_false.valid
-    same = np.all(np.abs(honest.z - some_false.z) < 1e-6, axis=-1)
-    assert 0.3 < np.mean(same[both]) < 0.7
+    seen = honest.valid & some_false.valid
+    same = np.all(np.abs(honest.z - some_false.z) < 1e-5, axis=-1)
+    assert same[seen].any()
+    assert not same[seen].all()
     assert (some_false.valid & ~honest.valid).any()

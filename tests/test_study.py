@@ -219,25 +219,21 @@ short = functools.partial(studied, scenario=SHORT, config=SHORT_CONFIG)
 lied = functools.partial(studied, scenario=LIED, config=LIED_CONFIG)
 
 
-def batch(faults, seed=0):
+def batch(faults):
     """What every run is given: the same but for its fault."""
     params, world, noise, prior = copies(len(faults), simulate.course_params(), simulate.room(), Noise(), SHORT.prior())
+    no_number = {"control": noise.v, "Q": params.Q, "R": params.R}
+    no_number |= {name: getattr(noise, name) for name in ("bearing", "range", "heading", "scan")}
     for i, fault in enumerate(faults):
-        if fault == "control":
-            noise.v[i] = np.nan
-        elif fault in ("bearing", "range", "heading", "scan"):
-            getattr(noise, fault)[i] = np.nan
-        elif fault == "Q":
-            params.Q[i] = np.nan
-        elif fault == "R":
-            params.R[i] = np.nan
+        if fault in no_number:
+            no_number[fault][i] = np.nan
         elif fault == "blind":
             world.landmarks[i] += 1e3
         elif fault == "off_map":
             prior.mean[i] -= 100
         elif fault == "wild":
             noise.v[i] = 4
-    keys = jax.random.split(jax.random.key(seed), len(faults))
+    keys = jax.random.split(jax.random.key(0), len(faults))
     return keys, *jax.tree.map(jnp.array, (params, world, noise, prior))
 
 
