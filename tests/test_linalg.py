@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlocmap.linalg import Matrix, forward, is_psd, ldl, mahalanobis, sandwich, solve
+from jaxlocmap.linalg import Matrix, forward, is_psd, ldl, mahalanobis, sandwich, solve, stack
 
 
 def random_psd(rng, n, rank=None):
@@ -61,6 +61,34 @@ def test_factor_and_solves_are_numpys(n, tolerance):
     np.testing.assert_allclose(dense(L) @ np.array(forward(L, r)), b, rtol=rtol, atol=rtol)
     np.testing.assert_allclose(np.array(solve(L, D, r)), np.linalg.solve(S, b), rtol=rtol, atol=rtol)
     np.testing.assert_allclose(mahalanobis(Matrix.of(jnp.array(S)), r), b @ np.linalg.solve(S, b), rtol=rtol)
+
+
+def test_stacked_scalars_are_numpys_array():
+    rng = np.random.default_rng(0)
+    for shape in ((1,), (3,), (1, 1), (2, 3), (3, 1)):
+        expected = np.asarray(jnp.array(rng.normal(size=shape)))
+        # As a function takes them apart and puts them together, for one and for many.
+        rebuilt = jax.jit(lambda x, shape=shape: stack(parts(x, shape)))
+        np.testing.assert_array_equal(rebuilt(expected), expected)
+        np.testing.assert_array_equal(jax.vmap(rebuilt)(expected[None].repeat(4, 0)), expected[None].repeat(4, 0))
+
+
+def parts(x, shape):
+    if len(shape) == 1:
+        return [x[i] for i in range(shape[0])]
+    return tuple([x[i, j] for j in range(shape[1])] for i in range(shape[0]))
+
+
+def test_reading_an_entry_of_a_stacked_matrix_costs_nothing():
+    """The compiled program of a batch holds the one entry that is asked for, and nothing of how it was stacked."""
+
+    def entry(x):
+        return stack([[x[0], x[1]], [x[2], 2 * x[3]]])[1, 0]
+
+    program = jax.jit(jax.vmap(entry, in_axes=1)).lower(jnp.ones((4, 50))).compile().as_text()
+    assert "slice(" in program
+    assert "concatenate(" not in program
+    assert "multiply(" not in program
 
 
 def psd(P):
