@@ -16,6 +16,8 @@ from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
+from jaxlocmap import batching
+
 
 class Limits(NamedTuple):
     """What one device should be given. Constants, so that every machine chooses the same chunk."""
@@ -25,7 +27,8 @@ class Limits(NamedTuple):
     most: int  # runs
 
 
-CPU = Limits(working=2 * 2**20, resident=256 * 2**20, most=1024)  # an L2 cache; an eighth of 2 GiB a core
+# An L2 cache; an eighth of 2 GiB a core; no power of two, since arrays whole pages apart push each other out of L1.
+CPU = Limits(working=2 * 2**20, resident=256 * 2**20, most=1536)
 ACCELERATOR = Limits(working=2 * 2**30, resident=4 * 2**30, most=2**16)  # what counts there is to be wide
 _LEAST = 8  # runs: the lanes of a vector register
 _FEW_TURNS = 8
@@ -88,21 +91,37 @@ class OneRun(NamedTuple):
     """A run to be compiled: hashable, equal where the compiled program is the same."""
 
     function: Callable[..., Any]  # (key, *args) -> pytree of arrays
+    kept: bool  # every run's own values are wanted, not their sum
     structure: Any  # of (key, args)
     leaves: tuple[jax.ShapeDtypeStruct, ...]
 
     @staticmethod
-    def of(function: Callable[..., Any], key: jax.Array, args: tuple[Any, ...]) -> OneRun:
+    def of(function: Callable[..., Any], kept: bool, key: jax.Array, args: tuple[Any, ...]) -> OneRun:
         """For arguments like these."""
         leaves, structure = jax.tree.flatten((key, args))
-        return OneRun(function, structure, tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves))
+        return OneRun(function, kept, structure, tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves))
 
 
 @functools.lru_cache(maxsize=64)
 def trace(run: OneRun) -> jax.stages.Traced:
-    """The run, traced once: its chunk is chosen from this and its program made of it."""
+    """The run, traced once: its chunk is chosen from this and its program made of it. A run that is not kept takes
+    whether it is `counted` after its key, and is a sum under `vmap`.
+    """
     key, args = jax.tree.unflatten(run.structure, run.leaves)
-    return jax.jit(run.function).trace(key, *args)
+    if run.kept:
+        return jax.jit(run.function).trace(key, *args)
+    return jax.jit(functools.partial(_summed, run.function)).trace(key, jax.ShapeDtypeStruct((), np.bool_), *args)
+
+
+def _summed(one_run: Any, key: jax.Array, counted: jax.Array, *args: Any) -> Any:
+    if hasattr(one_run, "summed"):
+        return one_run.summed(key, counted, *args)
+
+    def total(x: jax.Array) -> jax.Array:
+        real = x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
+        return batching.total(real, counted)
+
+    return jax.tree.map(total, one_run(key, *args))
 
 
 class Program(NamedTuple):
@@ -117,7 +136,7 @@ class Program(NamedTuple):
 
 
 @functools.lru_cache(maxsize=64)
-def compile(run: OneRun, chunk: int, keep_runs: bool, devices: tuple[Any, ...]) -> Program:
+def compile(run: OneRun, chunk: int, devices: tuple[Any, ...]) -> Program:
     """The program of `chunk` runs on each device. What it returns has a leading axis for the devices.
 
     Sums come as one array (devices, n) of all leaves in order, in the widest float type among them; kept runs as one
@@ -132,9 +151,13 @@ def compile(run: OneRun, chunk: int, keep_runs: bool, devices: tuple[Any, ...]) 
 
     def on_device(first: jax.Array, runs: jax.Array, key: jax.Array, args: Any) -> list[jax.Array]:
         index = first + jnp.arange(chunk, dtype=jnp.int32)
-        shared = jax.tree.leaves(args)
-        each = jax.vmap(lambda i: one_run(jax.random.fold_in(key, i), *shared))(index)
-        return [x[None] for x in each] if keep_runs else [_sums(each, index < runs)[None]]
+        keys, shared = jax.vmap(lambda i: jax.random.fold_in(key, i))(index), jax.tree.leaves(args)
+        if run.kept:
+            return [x[None] for x in jax.vmap(lambda key: one_run(key, *shared))(keys)]
+        add_up = jax.vmap(lambda key, counted: one_run(key, counted, *shared), out_axes=None)
+        sums = add_up(keys, index < runs)
+        widest = functools.reduce(np.promote_types, [x.dtype for x in sums])
+        return [jnp.concatenate([x.astype(widest).ravel() for x in sums])[None]]
 
     mesh = Mesh(np.array(devices), ("devices",))
     # Unchecked, so that a run may use constants without a thought of which values differ between devices.
@@ -145,17 +168,6 @@ def compile(run: OneRun, chunk: int, keep_runs: bool, devices: tuple[Any, ...]) 
     compiled = jax.jit(sharded).lower(first, runs, key, args).compile()
     check_memory(compiled, chunk, devices)
     return Program(compiled, mesh)
-
-
-def _sums(each: Sequence[jax.Array], live: jax.Array) -> jax.Array:
-    kinds = [x.dtype if jnp.issubdtype(x.dtype, jnp.inexact) else jnp.result_type(float) for x in each]
-    widest = functools.reduce(np.promote_types, kinds)
-
-    def total(x: jax.Array, kind: Any) -> jax.Array:
-        counted = jnp.where(live.reshape(-1, *[1] * (x.ndim - 1)), x.astype(kind), jnp.zeros((), kind))
-        return jnp.sum(counted, axis=0).astype(widest).ravel()
-
-    return jnp.concatenate([total(x, kind) for x, kind in zip(each, kinds, strict=True)])
 
 
 def check_memory(compiled: Any, chunk: int, devices: Sequence[Any]) -> None:

@@ -59,7 +59,9 @@ def monte_carlo(
 
     Args:
         one_run: `(key, *args) -> pytree of arrays`. Hashable and equal by value (a function, or an instance of a
-            frozen dataclass), so that the same study is compiled once.
+            frozen dataclass), so that the same study is compiled once. It may have a method
+            `summed(key, counted, *args)`, which under `vmap` returns the sum over the runs that are counted, by
+            `batching.total`: then sums come from that, and a run need not hold what can be added up while it goes on.
         key: of the whole study. runs: how many, >= 1.
         *args: pytrees of arrays handed to every run: parameters, the world. Changing their values compiles nothing.
         chunk: runs that a device computes at once. Memory grows with it, not with `runs`. By default that of the
@@ -97,7 +99,7 @@ def monte_carlo(
 
     began, compiled = time.perf_counter(), chunks.compile.cache_info().misses
     args, platform = jax.tree.map(jnp.asarray, args), devices[0].platform
-    run = chunks.OneRun.of(one_run, key, args)
+    run = chunks.OneRun.of(one_run, keep_runs, key, args)
     traced = chunks.trace(run)
     split = Split(runs, int(chosen[0]) or chunks.from_shapes(traced.jaxpr, runs, int(counts.sum()), platform))
     study: dict[str, Any] = {}
@@ -107,7 +109,7 @@ def monte_carlo(
         _check_agreement(study)
     if parts is not None:
         hosts.in_turn(lambda: parts.check(study))
-    program = chunks.compile(run, split.chunk, keep_runs, devices)
+    program = chunks.compile(run, split.chunk, devices)
     compile_s = time.perf_counter() - began if chunks.compile.cache_info().misses > compiled else 0.0
 
     own, finished = range(process, split.parts, processes), set[int]()

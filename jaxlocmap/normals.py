@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlocmap.trig import sin_cos
+
 Words = tuple[jax.Array, jax.Array]  # two uint32, () each
 
 _FEW = 8
@@ -49,23 +51,33 @@ def uniforms(key: Words, step: jax.Array, lane: Any, count: int, dtype: Any) -> 
         count: how many. dtype: floating point; multiples of 2**-24 in all of them, so that the same key gives the same
             numbers.
     """
-    return _draw(lambda word: _uniform(word, dtype), key, step, lane, count)
+    return _draw(lambda words: (_uniform(words[0], dtype), _uniform(words[1], dtype)), key, step, lane, count)
 
 
 def normals(key: Words, step: jax.Array, lane: Any, count: int, dtype: Any) -> jax.Array:
-    """Standard normal numbers (count,), arguments as in `uniforms`: √2 erf⁻¹(2 u - 1)."""
-    return _draw(lambda word: math.sqrt(2) * jax.lax.erf_inv(2 * _uniform(word, dtype) - 1), key, step, lane, count)
+    """Standard normal numbers (count,), arguments as in `uniforms`. Source: Box & Muller 1958.
+
+    √(-2 log u₁) cos(2π u₂) and, where there are few, √(-2 log u₁) sin(2π u₂).
+    """
+
+    def pair(words: Words) -> tuple[jax.Array, jax.Array]:
+        first, second = (_uniform(word, dtype) for word in words)
+        reach, (sin, cos) = jnp.sqrt(-2 * jnp.log(first)), sin_cos(2 * math.pi * second - math.pi)
+        return reach * cos, reach * sin
+
+    return _draw(pair, key, step, lane, count)
 
 
 def _uniform(word: jax.Array, dtype: Any) -> jax.Array:
     return ((word >> np.uint32(9)).astype(jnp.int32).astype(dtype) + 0.5) * 2.0**-23
 
 
-def _draw(number: Callable[[jax.Array], jax.Array], key: Words, step: jax.Array, lane: Any, count: int) -> jax.Array:
-    step, lane, pairs = jnp.asarray(step, jnp.uint32), jnp.asarray(lane, jnp.uint32), -(-count // 2)
+def _draw(numbers: Callable[[Words], Words], key: Words, step: jax.Array, lane: Any, count: int) -> jax.Array:
+    """Numbers (count,) from a function of two words to two numbers."""
+    step, lane = jnp.asarray(step, jnp.uint32), jnp.asarray(lane, jnp.uint32)
     if count <= _FEW:  # one by one, so that each lies in memory beside that of the next run
-        words = [word for i in range(pairs) for word in threefry(key, (step, lane + np.uint32(i)))]
-        return jnp.stack([number(word) for word in words[:count]])
-    # The second words are left alone: to put them behind the first would cost more than to draw again.
+        pairs = (numbers(threefry(key, (step, lane + np.uint32(i)))) for i in range(-(-count // 2)))
+        return jnp.stack([number for pair in pairs for number in pair][:count])
+    # The second numbers are left alone: to put them behind the first would cost more than to draw again.
     lanes = lane + jnp.arange(count, dtype=jnp.uint32)
-    return number(threefry(key, (jnp.full_like(lanes, step), lanes))[0])
+    return numbers(threefry(key, (jnp.full_like(lanes, step), lanes)))[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -162,20 +162,18 @@ def score_sighting(
 
 
 def run_totals(
-    kept: Kept,
     steps: StepTally,
     sightings: SightingTally,
     truth: jax.Array,
     belief: Gaussian,
     of_map: MapTotals | None,
-) -> Totals:
-    """What one run adds to a study."""
+) -> dict[str, Any]:
+    """What one run adds to a study: the fields of `Totals` that are not `Kept`, by name."""
     dtype = steps.nees.dtype
     run_nees = steps.nees / jnp.maximum(steps.scored, 1)
     run_nis = sightings.nis / jnp.maximum(sightings.observed, 1)
     ended = jnp.all(jnp.isfinite(truth - belief.mean)) & jnp.all(jnp.isfinite(jnp.diagonal(belief.cov)))
-    return Totals(
-        **kept._asdict(),
+    return dict(
         runs=jnp.ones((), dtype),
         scored_runs=(steps.scored > 0).astype(dtype),
         axis_nees=steps.axis_nees,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import consistency, grid, simulate
-from jaxlocmap.batching import cond, scan, zero_like_any
+from jaxlocmap.batching import cond, scan, total, zero_like_any
 from jaxlocmap.normals import words_of
 from jaxlocmap.pipeline import init
 from jaxlocmap.scoring import (
@@ -65,6 +66,26 @@ class Study:
             key: of this run. params: the filter's. world, noise, prior: as their fields say.
             gate_probability: takes the place of the configuration's; a value, so that a sweep over gates compiles once.
         """
+        return self._run(lambda x: x, key, params, world, noise, prior, gate_probability)
+
+    def summed(self, key: jax.Array, counted: jax.Array, *args: Any) -> Totals:
+        """Under `vmap` over runs, the totals of those that are `counted` (() bool), added up step by step.
+
+        Args:
+            key, *args: as of a call.
+        """
+        return self._run(lambda tree: jax.tree.map(lambda x: total(x, counted), tree), key, *args)
+
+    def _run(
+        self,
+        add_up: Callable[[Any], Any],
+        key: jax.Array,
+        params: Params,
+        world: World,
+        noise: simulate.Noise,
+        prior: Gaussian,
+        gate_probability: jax.Array | None = None,
+    ) -> Totals:
         params.check()
         config, scenario = self.config, self.scenario
         if gate_probability is not None:
@@ -110,7 +131,7 @@ class Study:
             stepped, error_square, variance = score_step(belief, pose, ok)
             kept = Kept(stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted)
             steps, sightings = jax.tree.map(jnp.add, (steps, sightings), (stepped, seen))
-            return (pose, belief, log_odds, latest, steps, sightings), kept
+            return (pose, belief, log_odds, latest, steps, sightings), add_up(kept)
 
         state = jax.tree.map(lambda x: x + zero, init(prior, config=config))
         none = jnp.full(landmarks.shape, zero)
@@ -125,7 +146,8 @@ class Study:
         (pose, belief, log_odds, _, steps, sightings), kept = scan(turn, begin, jnp.arange(scenario.steps))
         if log_odds is not None and config.grid is not None:
             log_odds = grid.clamp(log_odds, config.grid)
-        return run_totals(kept, steps, sightings, pose, belief, map_totals(log_odds, world, config))
+        of_run = run_totals(steps, sightings, pose, belief, map_totals(log_odds, world, config))
+        return Totals(**kept._asdict(), **add_up(of_run))
 
 
 def _mean_over_runs(total_and_square: np.ndarray, runs: int, expected: float) -> consistency.Mean:
