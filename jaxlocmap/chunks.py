@@ -27,8 +27,9 @@ class Limits(NamedTuple):
     most: int  # runs
 
 
-# An L2 cache; an eighth of 2 GiB a core; no power of two, since arrays whole pages apart push each other out of L1.
-CPU = Limits(working=2 * 2**20, resident=256 * 2**20, most=1536)
+# A few L2 caches, since of a map a loop touches some; an eighth of 2 GiB a core; wide, so that starting a kernel costs
+# little, but no power of two, since arrays whole pages apart push each other out of the cache.
+CPU = Limits(working=8 * 2**20, resident=256 * 2**20, most=3000)
 ACCELERATOR = Limits(working=2 * 2**30, resident=4 * 2**30, most=2**16)  # what counts there is to be wide
 _LEAST = 8  # runs: the lanes of a vector register
 _FEW_TURNS = 8

@@ -165,10 +165,14 @@ def entropy_bits(log_odds: jax.Array) -> jax.Array:
     Returns:
         () bits; a cell never seen counts one. Source: Cover & Thomas 2006, section 2.1.
     """
+    return jnp.sum(_bits(log_odds))
+
+
+def _bits(log_odds: jax.Array) -> jax.Array:
     # With q = exp(-|L|), the smaller probability is q / (1 + q), and nothing cancels where that is close to none.
     size = jnp.abs(log_odds)
     q = jnp.exp(-size)
-    return jnp.sum(jnp.log1p(q) + size * q / (1 + q)) / math.log(2)
+    return (jnp.log1p(q) + size * q / (1 + q)) / math.log(2)
 
 
 def brier(log_odds: jax.Array, occupied: jax.Array, where: jax.Array) -> jax.Array:
@@ -181,8 +185,8 @@ def brier(log_odds: jax.Array, occupied: jax.Array, where: jax.Array) -> jax.Arr
     Returns:
         () in [0, 1]; 0.25 is what knowing nothing scores; NaN without a cell. Source: Brier 1950.
     """
-    square = (probability(log_odds) - occupied.astype(log_odds.dtype)) ** 2
-    return jnp.sum(jnp.where(where, square, 0)) / jnp.sum(where, dtype=square.dtype)
+    sums = score(log_odds, occupied, where)
+    return sums.square / jnp.sum(sums.cells)
 
 
 class Calibration(NamedTuple):
@@ -205,27 +209,50 @@ def calibration(log_odds: jax.Array, occupied: jax.Array, where: jax.Array, *, b
     Returns:
         `Calibration`. Source: Murphy & Winkler 1977; the error is that of Guo et al. 2017, section 2.
     """
-    p = probability(log_odds)
-    index = jnp.where(where, jnp.clip((p * bins).astype(jnp.int32), 0, bins - 1), bins)
+    sums = score(log_odds, occupied, where, bins=bins)
+    return Calibration(
+        edges=jnp.linspace(0, 1, bins + 1, dtype=log_odds.dtype),
+        cells=sums.cells,
+        probability=sums.probability / sums.cells,
+        frequency=sums.occupied / sums.cells,
+        error=jnp.sum(jnp.abs(sums.probability - sums.occupied)) / jnp.sum(sums.cells),
+    )
 
+
+class Score(NamedTuple):
+    """Sums over the cells of a map."""
+
+    entropy_bits: jax.Array  # () over all cells
+    square: jax.Array  # () of probability minus truth, squared, over the scored cells, as are the rest
+    cells: jax.Array  # (bins,) cells by the probability the map gives them
+    probability: jax.Array  # (bins,) of those probabilities
+    occupied: jax.Array  # (bins,) how many of those cells are occupied
+
+
+def score(log_odds: jax.Array, occupied: jax.Array, where: jax.Array, *, bins: int = 10) -> Score:
+    """What `entropy_bits`, `brier` and `calibration` are made of, in one pass over the map; arguments as theirs."""
     each_bin = jnp.arange(bins, dtype=jnp.int32)[:, None]
 
-    def add_row(totals: tuple[jax.Array, ...], now: tuple[jax.Array, ...]) -> tuple[tuple[jax.Array, ...], None]:
-        index, *values = now
+    def row(L: jax.Array, occupied: jax.Array, where: jax.Array) -> Score:
+        p, truth = probability(L), occupied.astype(L.dtype)
+        index = jnp.where(where, jnp.clip((p * bins).astype(jnp.int32), 0, bins - 1), bins)
         chosen = index[None] == each_bin
-        return tuple(x + jnp.where(chosen, value[None], 0) for x, value in zip(totals, values, strict=True)), None
+        return Score(
+            entropy_bits=_bits(L),
+            square=jnp.where(where, (p - truth) ** 2, 0),
+            cells=chosen.astype(L.dtype),
+            probability=jnp.where(chosen, p[None], 0),
+            occupied=jnp.where(chosen, truth[None], 0),
+        )
+
+    def add_row(sums: Score, now: tuple[jax.Array, ...]) -> tuple[Score, None]:
+        return jax.tree.map(jnp.add, sums, row(*now)), None
 
     # Row by row, every column by itself, is vector code; a scatter would add one cell after the other.
-    none = jnp.full((bins, p.shape[1]), zero_like_any(log_odds, occupied, where).astype(p.dtype))
-    totals, _ = jax.lax.scan(add_row, (none, none, none), (index, jnp.ones_like(p), p, occupied.astype(p.dtype)))
-    cells, mean, share = (jnp.sum(total, axis=1) for total in totals)
-    return Calibration(
-        edges=jnp.linspace(0, 1, bins + 1, dtype=p.dtype),
-        cells=cells,
-        probability=mean / cells,
-        frequency=share / cells,
-        error=jnp.sum(jnp.abs(mean - share)) / jnp.sum(cells),
-    )
+    zero = zero_like_any(log_odds, occupied, where).astype(log_odds.dtype)
+    none = jax.tree.map(lambda x: jnp.full(x.shape, zero), jax.eval_shape(row, log_odds[0], occupied[0], where[0]))
+    columns, _ = jax.lax.scan(add_row, none, (log_odds, occupied, where))
+    return jax.tree.map(lambda x: jnp.sum(x, axis=-1), columns)
 
 
 def endpoint_covariance(

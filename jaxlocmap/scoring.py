@@ -197,12 +197,12 @@ def map_totals(log_odds: jax.Array | None, world: World, config: Config) -> MapT
     if log_odds is None or config.grid is None:
         return None
     occupied, seen = occupancy(world, config.grid), log_odds != 0
-    bins, scored = grid.calibration(log_odds, occupied, seen), jnp.any(seen)
+    sums = grid.score(log_odds, occupied, seen)
     return MapTotals(
-        entropy_bits=grid.entropy_bits(log_odds),
-        brier=jnp.where(scored, grid.brier(log_odds, occupied, seen), 0),
-        scored=scored.astype(log_odds.dtype),
-        cells=bins.cells,
-        probability=jnp.nan_to_num(bins.probability * bins.cells),
-        occupied=jnp.nan_to_num(bins.frequency * bins.cells),
+        entropy_bits=sums.entropy_bits,
+        brier=sums.square / jnp.maximum(jnp.sum(sums.cells), 1),
+        scored=jnp.any(seen).astype(log_odds.dtype),
+        cells=sums.cells,
+        probability=sums.probability,
+        occupied=sums.occupied,
     )

@@ -247,3 +247,31 @@ def test_any_in_batch_is_one_answer_for_all():
 def test_zero_like_any_is_zero_whatever_the_values(value):
     zero = jax.jit(batching.zero_like_any)({"a": jnp.asarray(value)}, None, jnp.array([1.0]))
     assert (int(zero), zero.dtype, zero.shape) == (0, jnp.int32, ())
+
+
+@pytest.mark.parametrize("in_axes", [(0, 0), (0, None), (None, 0)])
+def test_a_total_is_the_sum_over_those_counted_and_one_for_all(in_axes):
+    values, counted = jnp.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]]), jnp.array([True, False, True])
+    given = [x if axis == 0 else x[0] for x, axis in zip((values, counted), in_axes, strict=True)]
+    every = [np.broadcast_to(x, whole.shape) for x, whole in zip(given, (values, counted), strict=True)]
+    expected = np.where(every[1][:, None], every[0], 0).sum(0)
+    np.testing.assert_array_equal(jax.vmap(batching.total, in_axes, out_axes=None)(*given), expected)
+
+
+def test_a_total_of_one_run_alone_is_its_own_or_nothing():
+    x = jnp.array([1.0, 2.0])
+    np.testing.assert_array_equal(batching.total(x, jnp.array(True)), x)
+    np.testing.assert_array_equal(batching.total(x, jnp.array(False)), [0, 0])
+
+
+def test_a_total_inside_a_loop_keeps_one_number_a_turn():
+    """Else the loop would stack a number of every run."""
+
+    def run(start, counted):
+        return jax.lax.scan(lambda x, _: (2 * x, batching.total(x, counted)), start, length=3)[1]
+
+    add_up = jax.vmap(run, out_axes=None)
+    starts, counted = jnp.array([1.0, 10.0, 100.0]), jnp.array([True, True, False])
+    np.testing.assert_array_equal(add_up(starts, counted), [11, 22, 44])
+    loops = [e for e in jax.make_jaxpr(add_up)(starts, counted).eqns if e.primitive.name == "scan"]
+    assert [out.aval.shape for out in loops[0].outvars] == [(3,), (3,)]  # the carry of three runs, three turns

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxlocmap import batching
 from jaxlocmap.monte_carlo import monte_carlo, use_all_cores
 
 
@@ -47,6 +48,16 @@ def sums(runs):
     return jax.tree.map(lambda x: x.sum(0, dtype=np.float64), runs)
 
 
+class AddedUp:
+    """A run that knows how to be added up, and whose sum can be told from that of its runs."""
+
+    def __call__(self, key):
+        return jnp.zeros(3)
+
+    def summed(self, key, counted):
+        return batching.total(jax.random.uniform(key, (3,)), counted)
+
+
 # --- What comes back ---
 
 
@@ -56,6 +67,15 @@ def test_the_sums_are_those_of_a_python_loop(loop, runs, chunk, tolerance):
     value = monte_carlo(one_run, KEY, runs, *ARGS, chunk=chunk).value
     assert_close(value, sums(jax.tree.map(lambda x: x[:runs], loop)), tolerance(1e-13, 1e-5))
     assert {leaf.dtype for leaf in jax.tree.leaves(value)} == {np.dtype(np.float64)}
+
+
+@pytest.mark.parametrize("chunk", [3, 7, 16])
+def test_a_run_that_can_be_added_up_as_it_goes_is(chunk, tolerance):
+    study = AddedUp()
+    expected = sum(np.float64(jax.random.uniform(jax.random.fold_in(KEY, i), (3,))) for i in range(7))
+    value = monte_carlo(study, KEY, 7, chunk=chunk).value
+    np.testing.assert_allclose(value, expected, rtol=tolerance(1e-13, 1e-6))
+    assert not monte_carlo(study, KEY, 7, chunk=chunk, keep_runs=True).value.any()
 
 
 @pytest.mark.parametrize("chunk", [256, 7, 1])

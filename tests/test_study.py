@@ -374,6 +374,16 @@ def test_runs_that_go_wrong_and_one_that_does_not_are_simulate_run_and_numpy(fau
     assert sum(run.flagged_steps for run in expected) > SHORT.steps
 
 
+def test_added_up_step_by_step_a_study_is_the_sum_of_its_runs(faulty, tolerance):
+    """Of those that are counted, whatever goes wrong in the others."""
+    counted = np.arange(len(FAULTS)) % 3 != 1
+    add_up = jax.vmap(Study(SHORT, SHORT_CONFIG).summed, out_axes=None)
+    key, *args = batch(FAULTS)
+    got = jax.jit(add_up, compiler_options=PLAIN)(key, jnp.array(counted), *args)
+    expected = sums(jax.tree.map(lambda x: x[counted], faulty))
+    assert_same(got, expected, tolerance(1e-10, 1e-3), tolerance(1e-12, 1e-3))
+
+
 def test_runs_of_the_whole_loop_are_simulate_run_and_numpy(honest, tolerance):
     """From a start drawn from the prior, without gate and map; two laps."""
     args = jax.tree.map(jnp.array, copies(3, Params.from_std(**PLANT), simulate.room(), Noise(), HONEST.prior()))
