@@ -118,9 +118,9 @@ def _summed(one_run: Any, key: jax.Array, counted: jax.Array, *args: Any) -> Any
     if hasattr(one_run, "summed"):
         return one_run.summed(key, counted, *args)
 
-    def total(x: jax.Array) -> jax.Array:
-        real = x if jnp.issubdtype(x.dtype, jnp.inexact) else x.astype(jnp.result_type(float))
-        return batching.total(real, counted)
+    def total(x: Any) -> jax.Array:
+        real = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
+        return batching.total(jnp.asarray(x) if real else jnp.asarray(x, float), counted)
 
     return jax.tree.map(total, one_run(key, *args))
 

@@ -267,10 +267,15 @@ def test_course_problem_2_joseph_stays_positive_semi_definite(seed, rank, spread
     A = np.diag([1.0, spread, 1.0]) @ rng.normal(size=(3, rank))
     root = rng.normal(size=(2, 2))
     noise = precision * (root @ root.T + 1e-3 * np.eye(2))
-    cov = np.asarray(joseph(jnp.array(A @ A.T), jnp.array(rng.normal(size=(2, 3))), jnp.array(noise)), np.float64)
-    assert_symmetric(cov, A @ A.T, tolerance(1e-13, 1e-4))
-    # Both terms are squares, so what is below zero is rounding of the prior's size, and of K where S is near singular.
-    assert np.linalg.eigvalsh(cov)[0] >= -tolerance(1e-13, 1e-4) * np.linalg.eigvalsh(A @ A.T)[-1]
+    P, H = A @ A.T, rng.normal(size=(2, 3))
+    cov = np.asarray(joseph(jnp.array(P), jnp.array(H), jnp.array(noise)), np.float64)
+    assert_symmetric(cov, P, tolerance(1e-13, 1e-4))
+    # Both terms are squares whatever K is, so what is below zero is their rounding: of their size, to which a K adds
+    # that is itself off by the condition of S.
+    eps, S, norm = jnp.finfo(float).eps, H @ P @ H.T + noise, np.linalg.norm
+    K = np.linalg.solve(S, H @ P).T
+    size = norm(np.eye(3) - K @ H) ** 2 * norm(P) + norm(K) ** 2 * norm(noise)
+    assert np.linalg.eigvalsh(cov)[0] >= -4 * eps * size * (1 + eps * np.linalg.cond(S)) ** 2
 
 
 def test_positive_semi_definite_after_100_000_float32_steps():
