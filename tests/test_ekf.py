@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import reference
 import scipy.stats
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from jaxlocmap import Config, Gaussian, Inputs, Params, ekf, init, landmarks, motion, run
@@ -270,12 +270,12 @@ def test_course_problem_2_joseph_stays_positive_semi_definite(seed, rank, spread
     P, H = A @ A.T, rng.normal(size=(2, 3))
     cov = np.asarray(joseph(jnp.array(P), jnp.array(H), jnp.array(noise)), np.float64)
     assert_symmetric(cov, P, tolerance(1e-13, 1e-4))
-    # Both terms are squares whatever K is, so what is below zero is their rounding: of their size, to which a K adds
-    # that is itself off by the condition of S.
-    eps, S, norm = jnp.finfo(float).eps, H @ P @ H.T + noise, np.linalg.norm
+    # Both terms are squares whatever K is, so what is below zero is their rounding.
+    eps, S, norm = float(jnp.finfo(jnp.result_type(float)).eps), H @ P @ H.T + noise, np.linalg.norm
+    assume(eps * np.linalg.cond(S) < 0.1)  # else K is all rounding
     K = np.linalg.solve(S, H @ P).T
     size = norm(np.eye(3) - K @ H) ** 2 * norm(P) + norm(K) ** 2 * norm(noise)
-    assert np.linalg.eigvalsh(cov)[0] >= -4 * eps * size * (1 + eps * np.linalg.cond(S)) ** 2
+    assert np.linalg.eigvalsh(cov)[0] >= -10 * eps * size
 
 
 def test_positive_semi_definite_after_100_000_float32_steps():
