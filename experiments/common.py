@@ -40,6 +40,8 @@ class ComputeConfig:
     """How many of this machine's processor cores (or accelerators, where there are any) to use; all by default."""
     resume: bool = False
     """Go on with the study that was stopped in the folder --out."""
+    discard: bool = False
+    """Start anew where a study was stopped in the folder --out, and lose its finished runs."""
     distributed: bool = False
     """Share the work with other processes; a job of Slurm, Kubernetes or Open MPI needs no more than this."""
     coordinator: str | None = None
@@ -92,6 +94,7 @@ def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -
         out / "parts",
         settings,
         resume=config.resume,
+        discard=config.discard,
         say=lambda sentence: CONSOLE.print(sentence, highlight=False, soft_wrap=True),
     )
 
@@ -115,8 +118,7 @@ def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeCo
 
 def finish(parts: Parts) -> None:
     """Clear the parts of a study whose report is written, by whichever process."""
-    hosts.gather(np.zeros((), np.int32))  # until then nobody goes on
-    parts.clear()
+    hosts.in_turn(parts.clear)  # process 0 first, which has written the report by then
 
 
 @contextmanager
@@ -149,7 +151,7 @@ def output_folder(path: Path) -> Path:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / ".writable"
+        probe = path / f".writable-{os.getpid()}"  # several processes may share the folder
         probe.write_text("")
         probe.unlink()
     except OSError as error:

@@ -7,6 +7,7 @@ the gate buys. Every cell sees the same random numbers, so that cells differ by 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable
@@ -159,10 +160,25 @@ class SweepStudy:
         Args:
             x: (columns,). y: (rows,). The rest: as for `Study`, what the cells have in common.
         """
+        return self._cells(functools.partial(self.study, key), x, y, params, world, noise, prior)
 
+    def summed(self, key: jax.Array, counted: jax.Array, *args: Any) -> Totals:
+        """As `Study.summed`."""
+        return self._cells(functools.partial(self.study.summed, key, counted), *args)
+
+    def _cells(
+        self,
+        study: Callable[..., Totals],
+        x: jax.Array,
+        y: jax.Array,
+        params: Params,
+        world: simulate.World,
+        noise: simulate.Noise,
+        prior: Gaussian,
+    ) -> Totals:
         def cell(x: jax.Array, y: jax.Array) -> Totals:
             here = SWEPT[self.y].enter(SWEPT[self.x].enter(Cell(params, noise), x), y)
-            return self.study(key, here.params, world, here.noise, prior, gate_probability=here.gate_probability)
+            return study(here.params, world, here.noise, prior, gate_probability=here.gate_probability)
 
         # The random numbers do not depend on the cell, so they are drawn once for all of them.
         row = jax.vmap(cell, in_axes=(0, None))

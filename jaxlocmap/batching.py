@@ -12,6 +12,7 @@ from jax.custom_batching import custom_vmap
 
 from jaxlocmap.linalg import stack
 
+RUNS = "runs"  # the name of the axis of a chunk's runs
 _SMALL = 9  # entries: up to here an array is taken apart, such as the covariance of a pose
 
 
@@ -32,24 +33,13 @@ def _any_in_batch_vmap(axis_size: int, in_batched: list[bool], flags: jax.Array)
     return any_in_batch(flags), False
 
 
-@custom_vmap
-def total(x: jax.Array, counted: jax.Array) -> jax.Array:
-    """The sum of x, any shape, over the runs of a batch that are `counted` (() bool); of one run alone, x or zero.
+def sum_over_runs(x: jax.Array, counted: jax.Array) -> jax.Array:
+    """The sum of x, any shape, over the runs that are `counted` (() bool), under `vmap(..., axis_name=RUNS)`.
 
-    Under `vmap` it is the same for all of the batch, so it can be taken inside a loop, and what the loop stacks is one
-    sum a step instead of one value a run. Vectorise it once, over runs: a `vmap` over anything else would be summed
-    over, too.
+    It is the same for all runs, so it can be taken inside a loop: what the loop stacks is then one sum a step instead
+    of one value a run.
     """
-    return jnp.where(counted, x, 0)
-
-
-@total.def_vmap
-def _total_vmap(axis_size: int, in_batched: list[bool], x: jax.Array, counted: jax.Array) -> tuple[jax.Array, bool]:
-    x, counted = (
-        value if batched else jnp.broadcast_to(value, (axis_size, *value.shape))
-        for value, batched in zip((x, counted), in_batched, strict=True)
-    )
-    return jnp.sum(jnp.where(counted.reshape(-1, *[1] * (x.ndim - 1)), x, 0), axis=0), False
+    return jax.lax.psum(jnp.where(counted, x, 0), RUNS)
 
 
 def zero_like_any(*trees: Any) -> jax.Array:

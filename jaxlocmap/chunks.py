@@ -20,19 +20,20 @@ from jaxlocmap import batching
 
 
 class Limits(NamedTuple):
-    """What one device should be given. Constants, so that every machine chooses the same chunk."""
+    """What one device should be given. Constants, so that machines choose the same chunk for a long study."""
 
     working: int  # bytes that the loops of a chunk touch at every turn
     resident: int  # bytes that a chunk holds for as long as it runs
     most: int  # runs
 
 
-# A few L2 caches, since of a map a loop touches some; an eighth of 2 GiB a core; wide, so that starting a kernel costs
-# little, but no power of two, since arrays whole pages apart push each other out of the cache.
+# Some L2 caches (a scan touches a small part of a map); an eighth of 2 GiB a core; enough runs that what it costs to
+# start a kernel is little beside what it does.
 CPU = Limits(working=8 * 2**20, resident=256 * 2**20, most=3000)
 ACCELERATOR = Limits(working=2 * 2**30, resident=4 * 2**30, most=2**16)  # what counts there is to be wide
 _LEAST = 8  # runs: the lanes of a vector register
 _FEW_TURNS = 8
+_PAGES = 512  # runs: where these divide a chunk, its arrays lie whole pages apart and push each other out of the cache
 
 
 class RunBytes(NamedTuple):
@@ -78,51 +79,96 @@ def from_shapes(jaxpr: Any, runs: int, devices: int, platform: str) -> int:
 
     A multiple of 8 whose loops work inside the cache and whose values take little of the memory. It depends on the
     shapes and on whether the device is a CPU alone, unless `runs` are so few that `devices` would take no more than 8
-    turns: then the turns are made of equal size, so that no device waits for a last odd chunk.
+    turns: then the turns are made of equal size, so that no device waits for a last odd chunk, and another number of
+    runs may be another chunk, which is compiled anew.
     """
     limits = CPU if platform == "cpu" else ACCELERATOR
     need = run_bytes(jaxpr)
     fit = min(limits.most, limits.working // max(need.working, 1), limits.resident // max(need.resident, 1))
     chunk = max(fit // _LEAST, 1) * _LEAST
     turns = -(-runs // (chunk * devices))
-    return -(-runs // (turns * devices)) if turns <= _FEW_TURNS else chunk
+    if turns > _FEW_TURNS:
+        return chunk
+    chunk = -(-runs // (turns * devices))
+    return chunk + _LEAST if chunk % _PAGES == 0 else chunk
 
 
 class OneRun(NamedTuple):
     """A run to be compiled: hashable, equal where the compiled program is the same."""
 
     function: Callable[..., Any]  # (key, *args) -> pytree of arrays
-    kept: bool  # every run's own values are wanted, not their sum
+    keep_runs: bool  # every run's own values are wanted, not their sum
     structure: Any  # of (key, args)
     leaves: tuple[jax.ShapeDtypeStruct, ...]
+    x64: bool  # JAX may compute in 64 bits
 
     @staticmethod
-    def of(function: Callable[..., Any], kept: bool, key: jax.Array, args: tuple[Any, ...]) -> OneRun:
+    def of(function: Callable[..., Any], keep_runs: bool, key: jax.Array, args: tuple[Any, ...]) -> OneRun:
         """For arguments like these."""
         leaves, structure = jax.tree.flatten((key, args))
-        return OneRun(function, kept, structure, tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves))
+        shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves)
+        return OneRun(function, keep_runs, structure, shapes, jax.config.read("jax_enable_x64"))
+
+
+class Traced(NamedTuple):
+    """A run, traced."""
+
+    jaxpr: Any  # of (key, whether the run is counted, *args); adds up over the axis `RUNS` where runs are not kept
+    outputs: Any  # pytree of `ShapeDtypeStruct`
 
 
 @functools.lru_cache(maxsize=64)
-def trace(run: OneRun) -> jax.stages.Traced:
-    """The run, traced once: its chunk is chosen from this and its program made of it. A run that is not kept takes
-    whether it is `counted` after its key, and is a sum under `vmap`.
+def trace(run: OneRun) -> Traced:
+    """The run, traced once: its chunk is chosen from this and its program made of it.
+
+    Raises:
+        ValueError: it returns nothing.
     """
     key, args = jax.tree.unflatten(run.structure, run.leaves)
-    if run.kept:
-        return jax.jit(run.function).trace(key, *args)
-    return jax.jit(functools.partial(_summed, run.function)).trace(key, jax.ShapeDtypeStruct((), np.bool_), *args)
+
+    def one(key: jax.Array, counted: jax.Array, *args: Any) -> Any:
+        if run.keep_runs:
+            return run.function(key, *args)
+        if summed := getattr(run.function, "summed", None):
+            return summed(key, counted, *args)
+        return jax.tree.map(lambda x: batching.sum_over_runs(_real(x), counted), run.function(key, *args))
+
+    counted = jax.ShapeDtypeStruct((), np.bool_)
+    jaxpr, outputs = jax.make_jaxpr(one, axis_env=[(batching.RUNS, 1)], return_shape=True)(key, counted, *args)
+    if not jaxpr.out_avals:
+        raise ValueError(f"one_run: expected it to return arrays, got {outputs!r}")
+    return Traced(jaxpr, outputs)
 
 
-def _summed(one_run: Any, key: jax.Array, counted: jax.Array, *args: Any) -> Any:
-    if hasattr(one_run, "summed"):
-        return one_run.summed(key, counted, *args)
+def _real(x: Any) -> jax.Array:
+    return jnp.asarray(x) if jnp.issubdtype(jnp.result_type(x), jnp.inexact) else jnp.asarray(x, float)
 
-    def total(x: Any) -> jax.Array:
-        real = jnp.issubdtype(jnp.result_type(x), jnp.inexact)
-        return batching.total(jnp.asarray(x) if real else jnp.asarray(x, float), counted)
 
-    return jax.tree.map(total, one_run(key, *args))
+def _chunk(run: OneRun, chunk: int) -> Callable[..., list[jax.Array]]:
+    """The program of `chunk` runs: (index of the first, runs, key, args) -> arrays, as `compile` says."""
+    one_run = jaxpr_as_fun(trace(run).jaxpr)
+
+    def compute(first: jax.Array, runs: jax.Array, key: jax.Array, args: Any) -> list[jax.Array]:
+        number, shared = jnp.arange(chunk, dtype=jnp.int32), jax.tree.leaves(args)
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(first + number)
+        every = jax.vmap(
+            lambda key, counted: one_run(key, counted, *shared),
+            axis_name=batching.RUNS,
+            out_axes=0 if run.keep_runs else None,
+        )(keys, number < runs - first)
+        if run.keep_runs:
+            return every
+        widest = functools.reduce(np.promote_types, [x.dtype for x in every])
+        return [jnp.concatenate([x.astype(widest).ravel() for x in every])]
+
+    return compute
+
+
+def lowered_text(run: OneRun) -> str:
+    """What would be compiled for one run: its code, its settings and the shapes of its arguments."""
+    key, args = jax.tree.unflatten(run.structure, run.leaves)
+    index = jax.ShapeDtypeStruct((), np.int32)
+    return jax.jit(_chunk(run, 1)).lower(index, index, key, args).as_text()
 
 
 class Program(NamedTuple):
@@ -146,19 +192,11 @@ def compile(run: OneRun, chunk: int, devices: tuple[Any, ...]) -> Program:
     Raises:
         ValueError: it does not fit into memory.
     """
-    traced = trace(run)
-    one_run = jaxpr_as_fun(traced.jaxpr)
+    compute = _chunk(run, chunk)
     key, args = jax.tree.unflatten(run.structure, run.leaves)
 
-    def on_device(first: jax.Array, runs: jax.Array, key: jax.Array, args: Any) -> list[jax.Array]:
-        index = first + jnp.arange(chunk, dtype=jnp.int32)
-        keys, shared = jax.vmap(lambda i: jax.random.fold_in(key, i))(index), jax.tree.leaves(args)
-        if run.kept:
-            return [x[None] for x in jax.vmap(lambda key: one_run(key, *shared))(keys)]
-        add_up = jax.vmap(lambda key, counted: one_run(key, counted, *shared), out_axes=None)
-        sums = add_up(keys, index < runs)
-        widest = functools.reduce(np.promote_types, [x.dtype for x in sums])
-        return [jnp.concatenate([x.astype(widest).ravel() for x in sums])[None]]
+    def on_device(first: jax.Array, *others: Any) -> list[jax.Array]:
+        return [x[None] for x in compute(first[0], *others)]
 
     mesh = Mesh(np.array(devices), ("devices",))
     # Unchecked, so that a run may use constants without a thought of which values differ between devices.

@@ -69,7 +69,9 @@ def use_all_cores(count: int | None = None) -> int:
     devices = jax.local_devices()
     if count is not None and count > len(devices):
         what = "cores" if devices[0].platform == "cpu" else f"{devices[0].platform} devices"
-        raise ValueError(f"devices: expected at most {len(devices)}, the {what} of this machine, got {count}")
+        late = f", the devices that JAX has started with (here are {cores} cores)"
+        why = late if len(devices) < min(count, cores) else f", the {what} of this machine"
+        raise ValueError(f"devices: expected at most {len(devices)}{why}, got {count}")
     return count or len(devices)
 
 

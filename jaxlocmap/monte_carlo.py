@@ -27,7 +27,7 @@ _Arrays = tuple[np.ndarray, ...]  # of a chunk, a part or a study: its sums as o
 class Result(NamedTuple):
     """What came of a study."""
 
-    value: Any  # pytree of float64 NumPy arrays: sums over runs, or every run's own along axis 0
+    value: Any  # pytree of NumPy arrays: sums over runs in float64, or every run's own along axis 0, as it gave them
     chunk: int  # runs that a device computed at once
     devices: int  # of all processes together
     processes: int
@@ -60,13 +60,13 @@ def monte_carlo(
     Args:
         one_run: `(key, *args) -> pytree of arrays`. Hashable and equal by value (a function, or an instance of a
             frozen dataclass), so that the same study is compiled once. It may have a method
-            `summed(key, counted, *args)`, which under `vmap` returns the sum over the runs that are counted, by
-            `batching.total`: then sums come from that, and a run need not hold what can be added up while it goes on.
+            `summed(key, counted, *args)` that returns the sum over the runs that are counted, by
+            `batching.sum_over_runs`: then sums come from that, and a run need not hold what is added up on the way.
         key: of the whole study. runs: how many, >= 1.
         *args: pytrees of arrays handed to every run: parameters, the world. Changing their values compiles nothing.
         chunk: runs that a device computes at once. Memory grows with it, not with `runs`. By default that of the
-            study to resume, else chosen from the shapes by `chunks.from_shapes`: the same everywhere, unless there
-            are too few runs to keep all devices busy.
+            study to resume, else chosen from the shapes by `chunks.from_shapes`: the same everywhere, unless the runs
+            make few turns of the devices, which are then made equal.
         keep_runs: return each run's own values instead of their sums; in one process only.
         devices: of `jax.local_devices()`, all by default.
         progress: called with the number of runs done after each turn of the devices; in several processes, as if the
@@ -85,8 +85,7 @@ def monte_carlo(
     hosts.check_count("runs", runs, most=2**31 - 1)  # a run's index is an int32
     if chunk is not None:
         hosts.check_count("chunk", chunk)
-    if not hasattr(key, "dtype"):
-        raise TypeError(f"key: expected one made by jax.random.key, got {key!r}")
+    _check_key(key)
     devices = tuple(jax.local_devices() if devices is None else devices)
     if not devices:
         raise ValueError("devices: expected at least one, got none")
@@ -104,8 +103,7 @@ def monte_carlo(
     split = Split(runs, int(chosen[0]) or chunks.from_shapes(traced.jaxpr, runs, int(counts.sum()), platform))
     study: dict[str, Any] = {}
     if parts is not None or processes > 1:
-        text = traced.lower().as_text()
-        study = manifest(split, text, key, args, keep_runs=keep_runs, platform=platform)
+        study = manifest(split, chunks.lowered_text(run), key, args, keep_runs=keep_runs, platform=platform)
         _check_agreement(study)
     if parts is not None:
         hosts.in_turn(lambda: parts.check(study))
@@ -130,10 +128,16 @@ def monte_carlo(
     combine = _concatenate if keep_runs else _add_up
     totals = _totals(own, finished, split, computed, combine, parts)
     if processes > 1:
-        totals = _exchange(list(totals), split.parts, traced.out_info)
+        totals = _exchange(list(totals), split.parts, traced.outputs)
     total, run_s = combine(totals), time.perf_counter() - began
-    value = _kept(total, traced.out_info, runs) if keep_runs else _unpacked(total, traced.out_info)
+    value = _kept(total, traced.outputs, runs) if keep_runs else _unpacked(total, traced.outputs)
     return Result(value, split.chunk, int(counts.sum()), processes, resumed_runs, compile_s, run_s)
+
+
+def _check_key(key: Any) -> None:
+    typed = hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if (not typed and getattr(key, "dtype", None) != np.uint32) or key.ndim != (0 if typed else 1):
+        raise TypeError(f"key: expected one made by jax.random.key, got {key!r}")
 
 
 def _check_agreement(study: dict[str, Any]) -> None:

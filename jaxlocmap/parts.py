@@ -55,8 +55,7 @@ def manifest(split: Split, program: str, key: jax.Array, args: Any, **others: An
     """What makes a study what it is, in plain values by name: with the same manifest, parts are the same.
 
     Args:
-        split: how the runs are divided. program: lowered text of one run, which holds its code, its settings
-            and the shapes of its arguments.
+        split: how the runs are divided. program: of `chunks.lowered_text`.
         key, args: of the study. **others: what else must be the same.
     """
     sources = sorted(Path(__file__).parent.rglob("*.py"))
@@ -67,7 +66,8 @@ def manifest(split: Split, program: str, key: jax.Array, args: Any, **others: An
         "arguments": _digest(*(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(args))),
         "program": _digest(program.encode()),
         "precision": str(jax.dtypes.canonicalize_dtype(float)),
-        "jax": jax.__version__,
+        "jax": f"{jax.__version__}, jaxlib {importlib.metadata.version('jaxlib')}",
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "jaxlocmap": f"{_version()} {_digest(*(source.read_bytes() for source in sources))}",
     }
 
@@ -88,7 +88,7 @@ class Parts:
 
     A part's file is written under another name and then renamed, so it is there whole or not at all. Its checksum
     spans its numbers, its place and its study: a file that is damaged or from elsewhere is told, and its part done
-    again. Files are forced to disk once a second, so a power cut costs little more than the second before it.
+    again. Once a second all files written since are forced to disk, so a power cut costs little more than a second.
     """
 
     def __init__(
@@ -97,6 +97,7 @@ class Parts:
         settings: Mapping[str, Any] | None = None,
         *,
         resume: bool = False,
+        discard: bool = False,
         say: Callable[[str], None] = lambda sentence: None,
     ) -> None:
         """Nothing is touched before a study starts.
@@ -104,13 +105,15 @@ class Parts:
         Args:
             folder: of one study alone, made if need be. Several processes may share one or have one each.
             settings: plain values by name that the study was asked for; to go on, they must be the same.
-            resume: go on with the parts that are there. Otherwise they are discarded.
+            resume: go on with the parts that are there.
+            discard: start anew where there are any.
             say: called with a sentence on what is found, discarded or damaged.
         """
-        self.folder, self.settings, self.resume, self.say = Path(folder), dict(settings or {}), resume, say
+        self.folder, self.settings, self.say = Path(folder), dict(settings or {}), say
+        self.resume, self.discard = resume, discard
         self.runs_kept = 0  # in this process's parts
         self._manifest: dict[str, Any] = {}
-        self._synced = -math.inf
+        self._synced, self._unsynced = -math.inf, list[Path]()
 
     def recorded_chunk(self) -> int | None:
         """The chunk of the study that is to go on, if there is one."""
@@ -123,16 +126,22 @@ class Parts:
             manifest: of the study, from the function of that name.
 
         Raises:
-            ValueError: it should go on, but the folder belongs to another study; every difference is named.
+            ValueError: it should go on, but the folder belongs to another study; every difference is named. Or it
+                should neither go on nor discard what is there, and something is.
         """
         found, asked = self._found(), self._asked(manifest)
+        if not (self.resume or self.discard) and (runs := self._runs_there(found or asked)):
+            whose = "this" if found == asked else "another"
+            raise ValueError(
+                f"parts: expected resume or discard, since {self.folder} holds {runs:,} finished runs of {whose} study"
+            )
         if self.resume and found is not None and found != asked:
             names = [name for name in {**found, **asked} if found.get(name) != asked.get(name)]
             differences = "; ".join(f"{name} was {found.get(name)!r}, is {asked.get(name)!r}" for name in names)
             raise ValueError(f"resume: expected the study that {self.folder} belongs to, got another: {differences}")
 
     def open(self, manifest: Mapping[str, Any], parts: Iterable[int]) -> set[int]:
-        """Make the folder ready for a study: discard what is there, unless it is to go on.
+        """Make the folder ready for a study.
 
         Args:
             manifest: of the study. parts: numbers of those this process works on.
@@ -192,6 +201,7 @@ class Parts:
         for pattern in (f"{_name()}*", f"{_MANIFEST}*"):
             for file in self.folder.glob(pattern):
                 file.unlink(missing_ok=True)
+        self._unsynced = []
         with contextlib.suppress(OSError):
             self.folder.rmdir()
 
@@ -211,15 +221,17 @@ class Parts:
         return Split(manifest["runs"], manifest["chunk"])
 
     def _discard(self, found: dict[str, Any] | None, asked: dict[str, Any]) -> None:
-        split, kept = self._split(found or asked), {file.name for file in self.folder.glob(f"{_name()}*")}
-        runs = sum(split.runs_of(part) for part in range(split.parts) if _name(part) in kept)
-        if runs and not self.resume:
-            hint = "resume would have gone on with them" if found == asked else "they belong to another study"
-            self.say(f"discarding {runs:,} finished runs in {self.folder}: {hint}")
-        elif self.resume:
+        if not self.resume:
+            if runs := self._runs_there(found or asked):
+                self.say(f"discarding {runs:,} finished runs in {self.folder}")
+        else:
             damaged = f", {_MANIFEST} is damaged" if (self.folder / _MANIFEST).exists() else ""
             self.say(f"nothing to resume in {self.folder}{damaged}: starting with the first run")
         self.clear()
+
+    def _runs_there(self, manifest: Mapping[str, Any]) -> int:
+        split, there = self._split(manifest), {file.name for file in self.folder.glob(f"{_name()}*")}
+        return sum(split.runs_of(part) for part in range(split.parts) if _name(part) in there)
 
     def _is_whole(self, part: int) -> bool:
         try:
@@ -239,28 +251,29 @@ class Parts:
         """All of it or nothing, whenever the program or the machine dies."""
         temporary, sync = self.folder / f"{name}.writing", time.monotonic() > self._synced + _SYNC_EVERY
         try:
-            with temporary.open("wb") as file:
-                file.write(contents)
-                if sync:
-                    file.flush()
-                    os.fsync(file.fileno())
+            temporary.write_bytes(contents)
+            if sync:
+                for path in (*self._unsynced, temporary):
+                    _sync(path)
             temporary.replace(self.folder / name)
         except OSError:
             temporary.unlink(missing_ok=True)
             raise
         if sync:
-            _sync_folder(self.folder)
-            self._synced = time.monotonic()
+            with contextlib.suppress(OSError):  # not every file system lets folders be forced to disk
+                _sync(self.folder)
+            self._synced, self._unsynced = time.monotonic(), []
+        else:
+            self._unsynced.append(self.folder / name)
 
 
 def _name(part: int | None = None) -> str:
     return "part-" if part is None else f"part-{part:03d}"
 
 
-def _sync_folder(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # not every file system lets folders be forced to disk
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

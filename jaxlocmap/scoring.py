@@ -34,7 +34,7 @@ class Totals(NamedTuple):
 
     runs: jax.Array  # ()
     scored_runs: jax.Array  # () runs with any step scored
-    scored: jax.Array  # (T,) steps whose NEES is finite and not negative
+    scored: jax.Array  # (T,) steps whose covariance is one and whose NEES is finite
     nees: jax.Array  # (T,)
     error_square: tuple[jax.Array, ...]  # x, y, yaw: (T,) each, m², m², rad²
     variance: tuple[jax.Array, ...]  # the same of the filter's own
@@ -88,7 +88,7 @@ class Latest(NamedTuple):
     white: tuple[jax.Array, jax.Array]  # (L,) each: its innovation, whitened
 
 
-class Kept(NamedTuple):
+class PerStep(NamedTuple):
     """What is kept of each step: the fields of `Totals` of the same name."""
 
     scored: jax.Array
@@ -113,13 +113,17 @@ def no_sightings(zero: jax.Array) -> SightingTally:
 
 
 def score_step(
-    belief: Gaussian, truth: jax.Array, ok: jax.Array
+    belief: Gaussian, truth: jax.Array, ok: jax.Array, definite: jax.Array
 ) -> tuple[StepTally, tuple[jax.Array, ...], tuple[jax.Array, ...]]:
-    """The tally of one step, and its squared error and variance along x, y, yaw."""
+    """The tally of one step, and its squared error and variance along x, y, yaw.
+
+    Args:
+        belief, truth: after the step. ok: () bool, as in `Info`. definite: () bool, whether the covariance is one.
+    """
     dtype = truth.dtype
     error = consistency.pose_error(truth, belief.mean)
     nees = consistency.nees(error, belief.cov)
-    scored = jnp.isfinite(nees) & (nees >= 0)  # below zero the covariance is none
+    scored = definite & jnp.isfinite(nees) & (nees >= 0)
     nees = jnp.where(scored, nees, 0)
     squares = [jnp.where(scored, error[i] ** 2, 0) for i in range(3)]
     variances = [jnp.where(scored, belief.cov[i, i], 0) for i in range(3)]
@@ -168,7 +172,7 @@ def run_totals(
     belief: Gaussian,
     of_map: MapTotals | None,
 ) -> dict[str, Any]:
-    """What one run adds to a study: the fields of `Totals` that are not `Kept`, by name."""
+    """What one run adds to a study: the fields of `Totals` that are not `PerStep`, by name."""
     dtype = steps.nees.dtype
     run_nees = steps.nees / jnp.maximum(steps.scored, 1)
     run_nis = sightings.nis / jnp.maximum(sightings.observed, 1)

@@ -67,7 +67,7 @@ class Scenario:
     max_range: float = 8.0  # m
     min_range: float = 0.05  # m
     grid: GridSpec = _COURSE_GRID
-    outliers: bool = False  # some sightings are false: of anything in reach, in any direction
+    outliers: bool = False  # some sightings are false: at any range within reach, in any direction
     exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
 
     def looks(self, k: jax.Array) -> jax.Array:
@@ -207,11 +207,12 @@ def sight(
     dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
     reach = jnp.sqrt(dx * dx + dy * dy) + noise.range * draws[0]
     bearing = arctan2(dy, dx) - pose[2] + noise.bearing * draws[1]
-    if scenario.outliers:
+    near = reach < scenario.sight_range
+    if scenario.outliers:  # of what it reports, so that the rate is the share
         false = draws[2] < noise.outlier_rate
         reach = jnp.where(false, draws[3] * scenario.sight_range, reach)
         bearing = jnp.where(false, (2 * draws[4] - 1) * jnp.pi, bearing)
-    return jnp.stack([reach, wrap(bearing)]), reach < scenario.sight_range
+    return jnp.stack([reach, wrap(bearing)]), near
 
 
 def draw_scan(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import consistency, grid, simulate
-from jaxlocmap.batching import cond, scan, total, zero_like_any
+from jaxlocmap.batching import cond, scan, sum_over_runs, zero_like_any
 from jaxlocmap.normals import words_of
 from jaxlocmap.pipeline import init
 from jaxlocmap.scoring import (
-    Kept,
     Latest,
     MapTotals,
+    PerStep,
     SightingTally,
     Totals,
     map_totals,
@@ -68,13 +68,14 @@ class Study:
         """
         return self._run(lambda x: x, key, params, world, noise, prior, gate_probability)
 
-    def summed(self, key: jax.Array, counted: jax.Array, *args: Any) -> Totals:
-        """Under `vmap` over runs, the totals of those that are `counted` (() bool), added up step by step.
+    def summed(self, key: jax.Array, counted: jax.Array, *args: Any, **kwargs: Any) -> Totals:
+        """Under `vmap(..., axis_name=batching.RUNS)`, the totals of all runs that are `counted` (() bool), added up
+        step by step: what `monte_carlo` computes.
 
         Args:
-            key, *args: as of a call.
+            key, *args, **kwargs: as of a call.
         """
-        return self._run(lambda tree: jax.tree.map(lambda x: total(x, counted), tree), key, *args)
+        return self._run(lambda tree: jax.tree.map(lambda x: sum_over_runs(x, counted), tree), key, *args, **kwargs)
 
     def _run(
         self,
@@ -87,10 +88,11 @@ class Study:
         gate_probability: jax.Array | None = None,
     ) -> Totals:
         params.check()
+        dtype = prior.mean.dtype
+        params, world, noise = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, world, noise))
         config, scenario = self.config, self.scenario
         if gate_probability is not None:
             config = dataclasses.replace(config, gate_probability=gate_probability)
-        dtype = prior.mean.dtype
         zero = zero_like_any(key, params, world, noise, prior, gate_probability).astype(dtype)
         start_key, key = jax.random.split(key)
         start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
@@ -118,7 +120,7 @@ class Study:
             del pose, k
             return belief, no_sightings(zero), latest
 
-        def turn(carry: tuple[Any, ...], k: jax.Array) -> tuple[tuple[Any, ...], Kept]:
+        def turn(carry: tuple[Any, ...], k: jax.Array) -> tuple[tuple[Any, ...], PerStep]:
             pose, belief, log_odds, latest, steps, sightings = carry
             pose, control = simulate.drive(simulate.draw_drive(words, k, dtype), k, pose, noise, scenario=scenario)
             belief, moved = predict(params, belief, control, jnp.asarray(scenario.dt, dtype), config=config)
@@ -127,11 +129,14 @@ class Study:
                 draws = simulate.draw_scan(words, k, scenario=scenario, dtype=dtype)
                 ranges = simulate.look_round(draws, pose, world, noise, scenario=scenario)
                 log_odds = map_scan(params, log_odds, belief.mean, ranges, scenario.beam_angles(), config=config)
-            ok = moved & (seen.unusable == 0) & sound(belief)
-            stepped, error_square, variance = score_step(belief, pose, ok)
-            kept = Kept(stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted)
+            definite = sound(belief)
+            ok = moved & (seen.unusable == 0) & definite
+            stepped, error_square, variance = score_step(belief, pose, ok, definite)
+            at_step = PerStep(
+                stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted
+            )
             steps, sightings = jax.tree.map(jnp.add, (steps, sightings), (stepped, seen))
-            return (pose, belief, log_odds, latest, steps, sightings), add_up(kept)
+            return (pose, belief, log_odds, latest, steps, sightings), add_up(at_step)
 
         state = jax.tree.map(lambda x: x + zero, init(prior, config=config))
         none = jnp.full(landmarks.shape, zero)
@@ -143,11 +148,11 @@ class Study:
             no_steps(zero),
             no_sightings(zero),
         )
-        (pose, belief, log_odds, _, steps, sightings), kept = scan(turn, begin, jnp.arange(scenario.steps))
+        (pose, belief, log_odds, _, steps, sightings), per_step = scan(turn, begin, jnp.arange(scenario.steps))
         if log_odds is not None and config.grid is not None:
             log_odds = grid.clamp(log_odds, config.grid)
         of_run = run_totals(steps, sightings, pose, belief, map_totals(log_odds, world, config))
-        return Totals(**kept._asdict(), **add_up(of_run))
+        return Totals(**per_step._asdict(), **add_up(of_run))
 
 
 def _mean_over_runs(total_and_square: np.ndarray, runs: int, expected: float) -> consistency.Mean:

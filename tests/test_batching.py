@@ -249,29 +249,32 @@ def test_zero_like_any_is_zero_whatever_the_values(value):
     assert (int(zero), zero.dtype, zero.shape) == (0, jnp.int32, ())
 
 
+def over_runs(function, in_axes=0):
+    return jax.vmap(function, in_axes, out_axes=None, axis_name=batching.RUNS)
+
+
 @pytest.mark.parametrize("in_axes", [(0, 0), (0, None), (None, 0)])
-def test_a_total_is_the_sum_over_those_counted_and_one_for_all(in_axes):
+def test_a_sum_over_runs_is_of_those_counted_and_the_same_for_all(in_axes):
     values, counted = jnp.array([[1.0, 2.0], [3.0, np.nan], [5.0, 6.0]]), jnp.array([True, False, True])
     given = [x if axis == 0 else x[0] for x, axis in zip((values, counted), in_axes, strict=True)]
     every = [np.broadcast_to(x, whole.shape) for x, whole in zip(given, (values, counted), strict=True)]
     expected = np.where(every[1][:, None], every[0], 0).sum(0)
-    np.testing.assert_array_equal(jax.vmap(batching.total, in_axes, out_axes=None)(*given), expected)
+    np.testing.assert_array_equal(over_runs(batching.sum_over_runs, in_axes)(*given), expected)
 
 
-def test_a_total_of_one_run_alone_is_its_own_or_nothing():
-    x = jnp.array([1.0, 2.0])
-    np.testing.assert_array_equal(batching.total(x, jnp.array(True)), x)
-    np.testing.assert_array_equal(batching.total(x, jnp.array(False)), [0, 0])
+def test_a_sum_over_runs_is_over_nothing_else():
+    values = jnp.arange(6.0).reshape(3, 2)  # runs, cells
+    cells = jax.vmap(batching.sum_over_runs, (0, None))
+    np.testing.assert_array_equal(over_runs(cells)(values, jnp.ones(3, bool)), values.sum(0))
 
 
-def test_a_total_inside_a_loop_keeps_one_number_a_turn():
+def test_a_sum_over_runs_inside_a_loop_keeps_one_number_a_turn():
     """Else the loop would stack a number of every run."""
 
     def run(start, counted):
-        return jax.lax.scan(lambda x, _: (2 * x, batching.total(x, counted)), start, length=3)[1]
+        return jax.lax.scan(lambda x, _: (2 * x, batching.sum_over_runs(x, counted)), start, length=3)[1]
 
-    add_up = jax.vmap(run, out_axes=None)
     starts, counted = jnp.array([1.0, 10.0, 100.0]), jnp.array([True, True, False])
-    np.testing.assert_array_equal(add_up(starts, counted), [11, 22, 44])
-    loops = [e for e in jax.make_jaxpr(add_up)(starts, counted).eqns if e.primitive.name == "scan"]
+    np.testing.assert_array_equal(over_runs(run)(starts, counted), [11, 22, 44])
+    loops = [e for e in jax.make_jaxpr(over_runs(run))(starts, counted).eqns if e.primitive.name == "scan"]
     assert [out.aval.shape for out in loops[0].outvars] == [(3,), (3,)]  # the carry of three runs, three turns

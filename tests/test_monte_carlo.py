@@ -55,7 +55,7 @@ class AddedUp:
         return jnp.zeros(3)
 
     def summed(self, key, counted):
-        return batching.total(jax.random.uniform(key, (3,)), counted)
+        return batching.sum_over_runs(jax.random.uniform(key, (3,)), counted)
 
 
 # --- What comes back ---
@@ -145,6 +145,11 @@ def test_a_study_without_a_device_or_a_key_is_refused():
         monte_carlo(one_run, KEY, 5, *ARGS, devices=())
     with pytest.raises(TypeError, match=r"key: expected one made by jax\.random\.key, got 0"):
         monte_carlo(one_run, 0, 5, *ARGS)
+    for key in (np.int32(3), jax.random.split(KEY), jnp.zeros((2, 2), np.uint32)):
+        with pytest.raises(TypeError, match=r"key: expected one made by jax\.random\.key, got"):
+            monte_carlo(one_run, key, 5, *ARGS)
+    with pytest.raises(ValueError, match="one_run: expected it to return arrays, got None"):
+        monte_carlo(lambda key: None, KEY, 5)
 
 
 def test_leaves_of_several_types_add_up_in_their_own_places():
@@ -247,7 +252,7 @@ def test_asking_for_all_cores_too_late_leaves_the_devices_as_they_are():
 
 def test_more_devices_than_exist_are_refused():
     there = len(jax.local_devices())
-    with pytest.raises(ValueError, match=rf"^devices: expected at most {there}, the .* machine, got {there + 1}$"):
+    with pytest.raises(ValueError, match=rf"^devices: expected at most {there}, the .*, got {there + 1}$"):
         use_all_cores(there + 1)
     with pytest.raises(ValueError, match=r"^devices: expected at least 1, a whole number, got 0$"):
         use_all_cores(0)

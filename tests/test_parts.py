@@ -29,7 +29,7 @@ def folder(tmp_path):
 
 def opened(folder, study=STUDY, **kwargs):
     said = []
-    parts = Parts(folder, say=said.append, **kwargs)
+    parts = Parts(folder, say=said.append, **{"discard": not kwargs.get("resume")} | kwargs)
     return parts, parts.open(study, range(Split(study["runs"], study["chunk"]).parts)), said
 
 
@@ -112,17 +112,22 @@ def test_another_study_is_refused_and_each_difference_named(folder):
     assert opened(folder, resume=True, settings={"gate": 0.99, "map": True})[1] == {0}
 
 
-def test_without_resume_what_is_there_is_discarded_aloud(folder):
+@pytest.mark.parametrize(("seed", "whose"), [(1, "this"), (2, "another")])
+def test_what_is_there_is_not_lost_by_a_new_start(folder, seed, whose):
+    opened(folder)[0].save(0, ARRAYS)
+    told = rf"parts: expected resume or discard, since {folder} holds 4 finished runs of {whose} study"
+    with pytest.raises(ValueError, match=told):
+        opened(folder, STUDY | {"seed": seed}, discard=False)
+    assert opened(folder, resume=True)[1] == {0}
+
+
+def test_discarding_is_said(folder):
     for part in (0, 7):
         opened(folder)[0].save(part, ARRAYS)  # each time from the start
     _, finished, said = opened(folder)
     assert finished == set()
-    assert said == [f"discarding 2 finished runs in {folder}: resume would have gone on with them"]
+    assert said == [f"discarding 2 finished runs in {folder}"]
     assert not list(folder.glob("part-*"))
-    opened(folder)[0].save(0, ARRAYS)
-    assert opened(folder, STUDY | {"seed": 2})[2] == [
-        f"discarding 4 finished runs in {folder}: they belong to another study"
-    ]
 
 
 def test_nothing_to_resume_is_said(folder):
@@ -187,7 +192,7 @@ def test_files_are_forced_to_disk_but_not_more_than_once_a_second(folder, monkey
     for part, later in enumerate((0.5, 0.4, 0.2, 0.1)):
         now[0] += later
         parts.save(part, ARRAYS)
-    assert len(forced) == 4  # the third part and its folder
+    assert len(forced) == 2 + 3 + 1  # by the third part, all three, and their folder
 
 
 # --- What makes a study what it is ---

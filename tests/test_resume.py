@@ -72,12 +72,15 @@ def test_ctrl_c_stops_at_the_next_turn_and_says_how_to_go_on(tmp_path):
     assert result(tmp_path / "stopped") == result(tmp_path / "whole")
 
 
-def test_a_new_start_says_what_it_discards(tmp_path):
+def test_a_new_start_loses_nothing_unless_told_to(tmp_path):
     study = (WALKS, "--chunk", 7, "--devices", 1, "--out", tmp_path)
     assert ended(start(*study, DIE_AT="200", DIE_BY=str(int(signal.SIGKILL))))[0] == -signal.SIGKILL
-    status, said, err = ended(start(*study))
+    status, _, err = ended(start(*study))
+    refused = f"error: parts: expected resume or discard, since {tmp_path}/parts holds 203 finished runs of this study"
+    assert (status, err.strip()) == (1, refused)
+    status, said, err = ended(start(*study, "--discard"))
     assert status == 0, err
-    assert f"discarding 203 finished runs in {tmp_path}/parts: resume would have gone on with them" in said
+    assert f"discarding 203 finished runs in {tmp_path}/parts" in said
     assert report(tmp_path)["resumed_runs"] == 0
 
 

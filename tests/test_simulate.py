@@ -360,7 +360,7 @@ def sighted(distance, noise, *, scenario, count):
 
 def test_false_sightings_are_even_over_reach_and_bearing():
     """Whatever the landmark's own place is, and of one another."""
-    z, valid = map(np.asarray, sighted(jnp.array(20.0), Noise(outlier_rate=1.0), scenario=FALSE, count=40_000))
+    z, valid = map(np.asarray, sighted(jnp.array(3.0), Noise(outlier_rate=1.0), scenario=FALSE, count=40_000))
     assert valid.all()
     share = np.column_stack([z[:, 0] / FALSE.sight_range, (z[:, 1] / np.pi + 1) / 2]).astype(np.float64)
     for values in share.T:
@@ -373,11 +373,11 @@ def test_false_sightings_are_even_over_reach_and_bearing():
 
 @pytest.mark.parametrize("rate", [0.0, 0.1, 0.35])
 def test_the_share_of_false_sightings_is_the_rate(rate):
-    """Of a landmark out of reach only the false ones are reported; of one in reach the true ones are as ever."""
+    """A landmark out of reach is not reported, falsely or not; of one in reach the true sightings are as ever."""
     count, noise = 20_000, Noise(outlier_rate=rate)
     bound = scipy.stats.norm.isf(FAILURE / 2) * np.sqrt(count * rate * (1 - rate))
     _, valid = map(np.asarray, sighted(jnp.array(20.0), noise, scenario=FALSE, count=count))
-    assert abs(np.sum(valid) - count * rate) <= bound
+    assert not valid.any()
     (z, valid), (honest, _) = (
         map(np.asarray, sighted(jnp.array(3.0), noise, scenario=scenario, count=count)) for scenario in (FALSE, SHORT)
     )
@@ -403,8 +403,7 @@ def test_false_sightings_change_neither_the_drive_nor_what_is_true():
     jax.tree.map(close, honest, none_false)
     looks = np.arange(SHORT.steps) % SHORT.sight_period == 0
     assert not some_false.valid[:, ~looks].any()
-    seen = honest.valid & some_false.valid
+    np.testing.assert_array_equal(some_false.valid, honest.valid)
     same = np.all(np.abs(honest.z - some_false.z) < 1e-5, axis=-1)
-    assert same[seen].any()
-    assert not same[seen].all()
-    assert (some_false.valid & ~honest.valid).any()
+    assert same[honest.valid].any()
+    assert not same[honest.valid].all()

@@ -13,7 +13,7 @@ import reference
 import scipy.stats
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxlocmap import GridSpec, Params, init, run, simulate
+from jaxlocmap import GridSpec, Params, batching, init, run, simulate
 from jaxlocmap.consistency import COVERAGE_LEVELS
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.simulate import CAPSTONE, LOOP, Noise
@@ -377,7 +377,7 @@ def test_runs_that_go_wrong_and_one_that_does_not_are_simulate_run_and_numpy(fau
 def test_added_up_step_by_step_a_study_is_the_sum_of_its_runs(faulty, tolerance):
     """Of those that are counted, whatever goes wrong in the others."""
     counted = np.arange(len(FAULTS)) % 3 != 1
-    add_up = jax.vmap(Study(SHORT, SHORT_CONFIG).summed, out_axes=None)
+    add_up = jax.vmap(Study(SHORT, SHORT_CONFIG).summed, out_axes=None, axis_name=batching.RUNS)
     key, *args = batch(FAULTS)
     got = jax.jit(add_up, compiler_options=PLAIN)(key, jnp.array(counted), *args)
     expected = sums(jax.tree.map(lambda x: x[counted], faulty))
