@@ -27,7 +27,7 @@ from baselines import course, cpp, peers, tables
 from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
 
 import jaxlocmap
-from jaxlocmap import simulate
+from jaxlocmap import hosts, simulate
 from jaxlocmap.hosts import check_count, merge_kernels, use_all_cores
 from jaxlocmap.monte_carlo import Result, monte_carlo
 from jaxlocmap.study import Study, summarise
@@ -190,7 +190,7 @@ def _against_cpp(program: cpp.Program | None, mapping: bool, size: Size, seed: i
 
     if program is None:
         return {**row, "ours": statistics.median(speed() for _ in range(size.pairs))}
-    threads = os.cpu_count() or 1
+    threads = hosts.cores()
 
     def other(count: int) -> dict[str, Any]:
         return cpp.study(program, count, mapping=mapping, threads=threads, seed=seed)
@@ -335,7 +335,7 @@ def _machine(devices: int) -> dict[str, Any]:
         model = next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
     return {
         "cpu": model,
-        "cores": os.cpu_count(),
+        "cores": hosts.cores(),
         "devices": devices,
         "platform": jax.devices()[0].platform,
         "python": platform.python_version(),

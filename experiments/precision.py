@@ -300,7 +300,9 @@ def _standard_error(values: np.ndarray) -> float:
 
 
 def verdict(row: dict[str, Any]) -> str:
-    """What float32 costs, in words: broken covariances first, then a change of the ANEES that the study can see."""
+    """What float32 costs, in words: broken covariances first, then a change of the ANEES that would matter, which is
+    one larger than what the ANEES itself is known to. The change is known far better, and said with its own error.
+    """
     double, single = row["float64"], row["float32"]
     where = f"{row['steps']:,} steps" if row["detector_sharper"] == 1 else f"{row['detector_sharper']:g} times sharper"
     change = f"ANEES {_with_error(single, 'anees_difference', '+.1e')}"

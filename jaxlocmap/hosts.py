@@ -9,6 +9,7 @@ import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
@@ -46,6 +47,15 @@ def merge_kernels() -> None:
         os.environ["XLA_FLAGS"] = f"{flags} {_MERGED}".strip()
 
 
+def cores() -> int:
+    """Processor cores that this process may use: of the machine, or those that a batch system or container grants."""
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with contextlib.suppress(OSError, ValueError):  # no control group, or one without a quota ("max")
+        quota, period = map(int, Path("/sys/fs/cgroup/cpu.max").read_text().split())
+        count = min(count, -(-quota // period))
+    return max(count, 1)
+
+
 def use_all_cores(count: int | None = None) -> int:
     """One JAX device per processor core of this machine, if JAX has not started yet.
 
@@ -61,16 +71,16 @@ def use_all_cores(count: int | None = None) -> int:
     Raises:
         ValueError: a `count` below 1, or more devices than exist.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    here = cores()
     if count is not None:
         check_count("devices", count)
     with contextlib.suppress(RuntimeError):  # started already
-        jax.config.update("jax_num_cpu_devices", min(count or cores, cores))
+        jax.config.update("jax_num_cpu_devices", min(count or here, here))
     devices = jax.local_devices()
     if count is not None and count > len(devices):
         what = "cores" if devices[0].platform == "cpu" else f"{devices[0].platform} devices"
-        late = f", the devices that JAX has started with (here are {cores} cores)"
-        why = late if len(devices) < min(count, cores) else f", the {what} of this machine"
+        late = f", the devices that JAX has started with (here are {here} cores)"
+        why = late if len(devices) < min(count, here) else f", the {what} of this machine"
         raise ValueError(f"devices: expected at most {len(devices)}{why}, got {count}")
     return count or len(devices)
 
@@ -86,8 +96,9 @@ def join(
 
     Every process runs the same program. What is not given, JAX takes from the cluster it finds itself in (Slurm,
     Kubernetes, Open MPI). Call it before anything else touches JAX, and start the first study soon after: JAX gives
-    up on a process that comes 30 s after the first one to what they do first together. When a process dies, JAX ends
-    the others within two minutes, and not gracefully. Once joined, a process stays so: another call does nothing.
+    up on a process that comes 30 s after the first one to what they do first together, and on one that comes half an
+    hour later than the others to the end. When a process dies, JAX ends the others within two minutes, and not
+    gracefully. Once joined, a process stays so: another call does nothing.
 
     Args:
         coordinator: "host:port" of process 0, which listens there.
@@ -174,7 +185,7 @@ def gather(value: np.ndarray) -> np.ndarray:
         value: numbers of 4 or 8 bytes, of the same shape and dtype in every process.
 
     Returns:
-        (processes, *shape), bit for bit. It waits for the slowest process.
+        (processes, *shape), bit for bit. It waits for the slowest process, though not longer than XLA does (30 min).
 
     Raises:
         ConnectionError: a process is gone.

@@ -47,7 +47,7 @@ def uniforms(key: Words, step: jax.Array, lane: Any, count: int, dtype: Any) -> 
 
     Args:
         key: from `words_of`. step: () integer, >= 0. lane: () integer, >= 0, where to begin in what this key and step
-            have to give: two numbers a lane, so that uses apart take lanes apart.
+            have to give, so that uses apart take lanes apart: two numbers a lane, or one where more than 8 are drawn.
         count: how many. dtype: floating point; multiples of 2**-24 in all of them, so that the same key gives the same
             numbers.
     """
@@ -57,7 +57,9 @@ def uniforms(key: Words, step: jax.Array, lane: Any, count: int, dtype: Any) -> 
 def normals(key: Words, step: jax.Array, lane: Any, count: int, dtype: Any) -> jax.Array:
     """Standard normal numbers (count,), arguments as in `uniforms`. Source: Box & Muller 1958.
 
-    √(-2 log u₁) cos(2π u₂) and, where there are few, √(-2 log u₁) sin(2π u₂).
+        √(-2 log u₁) cos φ and, where there are few, √(-2 log u₁) sin φ, with φ = 2π u₂ - π
+
+    u₁ being at least 2**-24, none is further out than 5.77: one of 1e8 normal numbers would be.
     """
 
     def pair(words: Words) -> tuple[jax.Array, jax.Array]:

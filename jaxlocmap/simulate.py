@@ -70,6 +70,11 @@ class Scenario:
     outliers: bool = False  # some sightings are false: at any range within reach, in any direction
     exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
 
+    def __post_init__(self) -> None:
+        for name in ("steps", "sight_period", "beams"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Scenario.{name}: expected at least 1, got {getattr(self, name)}")
+
     def looks(self, k: jax.Array) -> jax.Array:
         """Whether the detector looks at step k."""
         return k % self.sight_period == 0

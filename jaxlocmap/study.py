@@ -128,7 +128,9 @@ class Study:
             if log_odds is not None:
                 draws = simulate.draw_scan(words, k, scenario=scenario, dtype=dtype)
                 ranges = simulate.look_round(draws, pose, world, noise, scenario=scenario)
-                log_odds = map_scan(params, log_odds, belief.mean, ranges, scenario.beam_angles(), config=config)
+                log_odds = map_scan(
+                    params, log_odds, belief.mean, ranges, scenario.beam_angles().astype(dtype), config=config
+                )
             definite = sound(belief)
             ok = moved & (seen.unusable == 0) & definite
             stepped, error_square, variance = score_step(belief, pose, ok, definite)

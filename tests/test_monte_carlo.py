@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import batching
+from jaxlocmap import batching, chunks, hosts
 from jaxlocmap.monte_carlo import monte_carlo, use_all_cores
 
 
@@ -256,3 +256,28 @@ def test_more_devices_than_exist_are_refused():
         use_all_cores(there + 1)
     with pytest.raises(ValueError, match=r"^devices: expected at least 1, a whole number, got 0$"):
         use_all_cores(0)
+
+
+@pytest.mark.parametrize(("quota", "expected"), [("max 100000", None), ("150000 100000", 2), ("1000 100000", 1)])
+def test_a_container_s_quota_counts_as_cores(monkeypatch, quota, expected):
+    monkeypatch.setattr(hosts.os, "sched_getaffinity", lambda _: range(16), raising=False)
+    monkeypatch.setattr(hosts.Path, "read_text", lambda _: quota)
+    assert hosts.cores() == (expected or 16)
+
+
+def test_precisions_are_compiled_apart(x64):
+    def one(key):
+        return jnp.asarray(0.1, float)
+
+    assert monte_carlo(one, KEY, 2, keep_runs=True).value.dtype == np.float64
+    with jax.enable_x64(False):
+        assert monte_carlo(one, KEY, 2, keep_runs=True).value.dtype == np.float32
+
+
+def test_the_last_runs_there_can_be_are_counted_once():
+    """Their chunk reaches past the largest index."""
+    run = chunks.OneRun.of(lambda key: jnp.ones(()), False, KEY, ())
+    program = chunks.compile(run, 100, tuple(jax.local_devices()[:1]))
+    last = 2**31 - 1
+    runs, shared = program.place((np.int32(last), (KEY, ())))
+    assert program.compute(np.array([last - 30], np.int32), runs, *shared)[0][0, 0] == 30

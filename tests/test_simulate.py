@@ -407,3 +407,9 @@ def test_false_sightings_change_neither_the_drive_nor_what_is_true():
     same = np.all(np.abs(honest.z - some_false.z) < 1e-5, axis=-1)
     assert same[honest.valid].any()
     assert not same[honest.valid].all()
+
+
+@pytest.mark.parametrize("name", ["steps", "sight_period", "beams"])
+def test_a_scenario_without_steps_looks_or_beams_is_refused(name):
+    with pytest.raises(ValueError, match=rf"^Scenario\.{name}: expected at least 1, got 0$"):
+        dataclasses.replace(SHORT, **{name: 0})

@@ -755,3 +755,11 @@ def test_runs_without_a_score_are_no_part_of_the_average():
     report = summarise(lost, SHORT_CONFIG)
     assert (report["runs"], report["anees"], report["nis_mean"]) == (5, 3.0, 2.5)
     assert report["unscored_steps"] == 6
+
+
+def test_the_priors_dtype_wins_over_that_of_everything_else(x64):
+    """As in `pipeline.run`."""
+    prior = jax.tree.map(lambda x: x.astype(jnp.float32), SHORT.prior())
+    args = (simulate.course_params(), simulate.room(), Noise(), prior)
+    shapes = jax.eval_shape(Study(SHORT, SHORT_CONFIG), jax.random.key(0), *args)
+    assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {np.dtype(np.float32)}

@@ -213,8 +213,10 @@ constexpr Belief kPrior = {1, 1, 0, 0.05f, 0, 0, 0.05f, 0, 0.02f};
 
 // What a correction reports of one observation.
 struct Report {
-    float nis, log_likelihood, white_range, white_bearing;
+    float nis, det, white_range, white_bearing;  // det: of the innovation's covariance
     bool used, accepted;
+
+    float log_likelihood() const { return used ? -0.5f * (nis + std::log(det)) - std::log(2 * kPi) : 0; }
 };
 
 // The exact arc, its chord v dt sinc(w dt / 2) in the direction theta + w dt / 2, and its exact Jacobians.
@@ -271,11 +273,11 @@ inline Report correct(Belief& b, const Sighting& z, Point landmark) {
     const float per_d0 = 1 / s00, l = s01 * per_d0, d1 = s11 - l * s01, per_d1 = 1 / d1;
     const float y1 = r1 - l * r0;
     report.nis = r0 * r0 * per_d0 + y1 * y1 * per_d1;
-    report.log_likelihood = -0.5f * (report.nis + std::log(s00 * d1)) - std::log(2 * kPi);
+    report.det = s00 * d1;
     report.used = true;
     report.white_range = r0 * std::sqrt(per_d0);
     report.white_bearing = y1 * std::sqrt(per_d1);
-    report.accepted = report.nis < kGate && std::isfinite(report.log_likelihood);
+    report.accepted = report.nis < kGate && s00 > 0 && d1 > 0;
     if (!report.accepted) return report;
 
     // K = P H' S^-1, from L D L'
@@ -427,7 +429,7 @@ struct Sums {
     } step[kSteps];
     float axis_nees[3], within[3], covered[4];
     float lag_products[2], lag_squares[2], lag_pairs;
-    float unscored, flagged, diverged, observing, log_likelihood;
+    float unscored, flagged, diverged, observing;
     MeanAndSquare run_nees, run_nis, run_position2, run_yaw2, known_bits, brier;
     float cells[kBins], probability[kBins], occupied[kBins];
 };
@@ -542,9 +544,8 @@ class Score {
         lost_ |= position2 > kLostSquare && nees > kLostNees;
     }
 
-    void finish(float log_likelihood) {
+    void finish() {
         const float steps = std::max(steps_, 1);
-        sums_.log_likelihood += log_likelihood;
         sums_.run_nees.add(nees_ / steps);
         sums_.run_position2.add(position2_ / steps);
         sums_.run_yaw2.add(yaw2_ / steps);
@@ -591,13 +592,11 @@ void one_run(const World& world, uint64_t seed, uint64_t run, Map& map, Sums& su
     Belief belief = kPrior;
     Measured measured;
     Score score(sums);
-    float log_likelihood = 0;
     if (parts & kMap) map.clear();
     for (int k = 0; k < kSteps; ++k) {
         robot.step(world, k, parts & kScan, normal, measured);
         if (parts & kFilter)
             sums.flagged += !filter(world, measured, belief, [&](int j, const Report& report) {
-                log_likelihood += report.log_likelihood;
                 if (parts & kScore) score.observation(k, j, report);
             });
         if (parts & kScore) score.step(k, robot, belief);
@@ -607,7 +606,7 @@ void one_run(const World& world, uint64_t seed, uint64_t run, Map& map, Sums& su
             for (const Sighting& z : measured.sighting) sums.step[k].nis += measured.looks && z.valid ? z.bearing : 0;
         }
     }
-    if (parts & kScore) score.finish(log_likelihood);
+    if (parts & kScore) score.finish();
     if ((parts & kWhole) == kWhole) score.map(map, world);
 }
 
@@ -682,8 +681,7 @@ void print_study(Study& result, int runs, int threads, bool mapping) {
     std::printf(", \"innovation_lag_range\": %.9g, \"innovation_lag_bearing\": %.9g",
                 at(layout.lag_products[0]) / at(layout.lag_squares[0]),
                 at(layout.lag_products[1]) / at(layout.lag_squares[1]));
-    std::printf(", \"diverged_runs\": %.0f, \"flagged_steps\": %.0f, \"log_likelihood\": %.9g", at(layout.diverged),
-                at(layout.flagged), at(layout.log_likelihood) / runs);
+    std::printf(", \"diverged_runs\": %.0f, \"flagged_steps\": %.0f", at(layout.diverged), at(layout.flagged));
     if (mapping) {
         mean("entropy_bits", layout.known_bits, runs, kRows * kColumns);
         mean("brier", layout.brier, runs);
@@ -743,7 +741,7 @@ void profile(const World& world, int runs) {
         Belief belief = kPrior;
         float sum = 0;
         for (int k = 0; k < kSteps; ++k)
-            sum += filter(world, inputs[k], belief, [&](int, const Report& report) { sum += report.log_likelihood; });
+            sum += filter(world, inputs[k], belief, [&](int, const Report& report) { sum += report.log_likelihood(); });
         sink = sink + sum + belief.x;
     });
     std::printf("{\"unit\": \"us a run, one thread\", \"drive_normals\": %.2f, \"drive\": %.2f, \"filter\": %.2f, "
@@ -772,7 +770,7 @@ int check(const World& world) {
             measured.sighting[j] = {z[2 * at], z[2 * at + 1], valid[at] != 0};
         std::copy_n(range + kBeams * k, kBeams, measured.range);
         float log_likelihood = 0;
-        filter(world, measured, belief, [&](int, const Report& report) { log_likelihood += report.log_likelihood; });
+        filter(world, measured, belief, [&](int, const Report& report) { log_likelihood += report.log_likelihood(); });
         map->add(world, belief.x, belief.y, belief.theta, measured.range);
         std::fwrite(&belief, sizeof(float), 9, stdout);
         std::fwrite(&log_likelihood, sizeof(float), 1, stdout);

@@ -72,7 +72,7 @@ def _studies(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
         other = "no C++ compiler here" if study["cpp"] is None else f"C++ {row['other']:,.0f} runs/s"
         yield what, f"{row['ours']:,.0f} runs/s", other, _ratio(row)
     speed, python = f"{study['with_map']['ours']:,.0f} runs/s", f"Python {study['course']['seconds_a_run']:.2f} s a run"
-    yield "the same, plain Python", speed, python, f"{study['course']['ratio']:,.0f}"
+    yield "the same, plain Python on one core", speed, python, f"{study['course']['ratio']:,.0f}"
 
 
 def _filters(report: dict[str, Any]) -> Iterator[tuple[str, ...]]:
