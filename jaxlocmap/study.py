@@ -98,6 +98,7 @@ class Study:
         start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
         words = words_of(key)
         landmarks = jnp.arange(len(world.landmarks), dtype=jnp.int32)
+        beam_angles = scenario.beam_angles().astype(dtype)
 
         def sight(pose: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
             """Look for one landmark after the other, and correct by it."""
@@ -128,9 +129,7 @@ class Study:
             if log_odds is not None:
                 draws = simulate.draw_scan(words, k, scenario=scenario, dtype=dtype)
                 ranges = simulate.look_round(draws, pose, world, noise, scenario=scenario)
-                log_odds = map_scan(
-                    params, log_odds, belief.mean, ranges, scenario.beam_angles().astype(dtype), config=config
-                )
+                log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
             definite = sound(belief)
             ok = moved & (seen.unusable == 0) & definite
             stepped, error_square, variance = score_step(belief, pose, ok, definite)
