@@ -55,9 +55,13 @@ def _walk(jaxpr: Any) -> tuple[int, int, int]:
     last = {id(used): k for k, equation in enumerate(jaxpr.eqns) for used in equation.invars}
     last |= {id(result): len(jaxpr.eqns) for result in jaxpr.outvars}
     dying: dict[int, int] = {}  # bytes that are used for the last time by an equation
+    summed = _summed(jaxpr)
     largest = loop = alive = peak = 0
     for k, equation in enumerate(jaxpr.eqns):
-        made = {id(out): math.prod(out.aval.shape) * out.aval.dtype.itemsize for out in equation.outvars}
+        made = {
+            id(out): 0 if id(out) in summed else math.prod(out.aval.shape) * out.aval.dtype.itemsize
+            for out in equation.outvars
+        }
         inside = [_walk(inner) for inner in jaxprs_in_params(equation.params)]
         if equation.primitive.name in ("scan", "while"):
             carry = sum(list(made.values())[: equation.params.get("num_carry")])  # of a `while`, all it makes
@@ -72,6 +76,20 @@ def _walk(jaxpr: Any) -> tuple[int, int, int]:
                 alive += size
         alive -= dying.pop(k, 0)
     return largest, loop, peak
+
+
+def _summed(jaxpr: Any) -> set[int]:
+    """The values that are sums over the runs of a chunk, so that a run has no part in their bytes."""
+    summed = set[int]()
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "psum":
+            summed |= {id(out) for out in equation.outvars}
+        if equation.primitive.name == "scan":
+            body = equation.params["jaxpr"].jaxpr
+            inside = _summed(body)
+            stacked = zip(equation.outvars, body.outvars, strict=True)
+            summed |= {id(out) for out, within in stacked if id(within) in inside}
+    return summed
 
 
 def from_shapes(jaxpr: Any, runs: int, devices: int, platform: str) -> int:

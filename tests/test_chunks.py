@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import chunks
+from jaxlocmap import batching, chunks
 from jaxlocmap.monte_carlo import monte_carlo
 
 KEY = jax.random.key(0)
@@ -68,6 +68,17 @@ def test_without_a_loop_the_largest_value_counts_and_what_is_dead_does_not():
         return b.sum() * 3
 
     assert need(straight, vector(1000)) == (4000, 8000)
+
+
+def test_what_is_summed_over_the_runs_counts_for_no_run():
+    def add_up(x, counted):
+        def body(carry, _):
+            return 2 * carry, (batching.sum_over_runs(carry, counted), carry[:7])
+
+        return jax.lax.scan(body, x, length=20)
+
+    jaxpr = jax.make_jaxpr(add_up, axis_env=[(batching.RUNS, 1)])(vector(100), True)
+    assert chunks.run_bytes(jaxpr).resident == 4 * (100 + 20 * 7)
 
 
 # --- The choice ---
