@@ -17,6 +17,8 @@ from jaxlocmap import Config, Gaussian, GridSpec, Inputs, Params
 
 X64 = os.environ.get("JAXLOCMAP_X64", "1") != "0"
 jax.config.update("jax_enable_x64", X64)
+# Compiling takes most of the time. The float32 job, and programs in processes of their own, compile as users do.
+jax.config.update("jax_disable_most_optimizations", X64)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
