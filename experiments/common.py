@@ -10,6 +10,7 @@ import shlex
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,7 +23,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxlocmap import Params, hosts
+from jaxlocmap import Params, hosts, simulate
 from jaxlocmap.monte_carlo import Result, monte_carlo
 from jaxlocmap.parts import Parts
 
@@ -116,6 +117,23 @@ def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeCo
         raise KeyboardInterrupt(*kept) from None
 
 
+def how_computed(result: Result, runs: int, began: float, per_run: int = 1) -> dict[str, Any]:
+    """What a report says of the computation.
+
+    Args:
+        began: of `time.perf_counter`. per_run: how many runs of a filter each of the `runs` stands for.
+    """
+    return {
+        "chunk": result.chunk,
+        "devices": result.devices,
+        "processes": result.processes,
+        "resumed_runs": result.resumed_runs,
+        "wall_s": time.perf_counter() - began,
+        "compile_s": result.compile_s,
+        "runs_per_s": (runs - result.resumed_runs) * per_run / result.run_s,
+    }
+
+
 def finish(parts: Parts) -> None:
     """Clear the parts of a study whose report is written, by whichever process."""
     hosts.in_turn(parts.clear)  # process 0 first, which has written the report by then
@@ -157,6 +175,17 @@ def output_folder(path: Path) -> Path:
     except OSError as error:
         raise OSError(f"out: expected a folder that can be written, got {path}: {error.strerror}") from None
     return path
+
+
+def scenario_of(name: str) -> simulate.Scenario:
+    """The scenario of that name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in simulate.SCENARIOS:
+        raise ValueError(f"scenario: expected one of {sorted(simulate.SCENARIOS)}, got {name!r}")
+    return simulate.SCENARIOS[name]
 
 
 def params_or(path: Path | None, default: Params) -> Params:

@@ -15,9 +15,11 @@ from common import (
     ComputeConfig,
     command_line,
     finish,
+    how_computed,
     output_folder,
     params_or,
     saved,
+    scenario_of,
     show,
     start,
     study,
@@ -57,13 +59,11 @@ class ConsistencyConfig:
 def main(config: ConsistencyConfig) -> dict[str, Any]:
     """Run the study, write the report and the figures."""
     out = output_folder(config.out)
-    if config.scenario not in simulate.SCENARIOS:
-        raise ValueError(f"scenario: expected one of {sorted(simulate.SCENARIOS)}, got {config.scenario!r}")
+    scenario = scenario_of(config.scenario)
     if config.runs < 1:
         raise ValueError(f"runs: expected at least 1, got {config.runs}")
     runs = min(config.runs, 100) if config.quick else config.runs
     start(config.compute)
-    scenario = simulate.SCENARIOS[config.scenario]
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=config.map)
     params = params_or(config.params, simulate.course_params())
     world, noise, prior = simulate.room(), simulate.Noise(), scenario.prior()
@@ -83,13 +83,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         **summarise(totals.value, settings),
         "params": {name: np.asarray(value).tolist() for name, value in params._asdict().items()},
         "seed": config.seed,
-        "chunk": totals.chunk,
-        "devices": totals.devices,
-        "processes": totals.processes,
-        "resumed_runs": totals.resumed_runs,
-        "wall_s": time.perf_counter() - began,
-        "compile_s": totals.compile_s,
-        "runs_per_s": (runs - totals.resumed_runs) / totals.run_s,
+        **how_computed(totals, runs, began),
     }
     if jax.process_index() == 0:
         write_report(out, report)

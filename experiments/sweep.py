@@ -23,9 +23,11 @@ from common import (
     ComputeConfig,
     command_line,
     finish,
+    how_computed,
     output_folder,
     params_or,
     saved,
+    scenario_of,
     start,
     study,
     study_parts,
@@ -34,6 +36,7 @@ from common import (
 from rich.table import Table
 
 from jaxlocmap import Config, Gaussian, Params, plotting, simulate
+from jaxlocmap.batching import sum_over_runs
 from jaxlocmap.consistency import readable
 from jaxlocmap.study import Study, Totals, summarise
 
@@ -154,48 +157,36 @@ class SweepStudy:
         world: simulate.World,
         noise: simulate.Noise,
         prior: Gaussian,
+        **how: Any,
     ) -> Totals:
         """Totals (rows, columns, ...) of the run that `key` stands for: common random numbers, the same for all cells.
 
         Args:
             x: (columns,). y: (rows,). The rest: as for `Study`, what the cells have in common.
         """
-        return self._cells(functools.partial(self.study, key), x, y, params, world, noise, prior)
 
-    def summed(self, key: jax.Array, counted: jax.Array, *args: Any) -> Totals:
-        """As `Study.summed`."""
-        return self._cells(functools.partial(self.study.summed, key, counted), *args)
-
-    def _cells(
-        self,
-        study: Callable[..., Totals],
-        x: jax.Array,
-        y: jax.Array,
-        params: Params,
-        world: simulate.World,
-        noise: simulate.Noise,
-        prior: Gaussian,
-    ) -> Totals:
         def cell(x: jax.Array, y: jax.Array) -> Totals:
             here = SWEPT[self.y].enter(SWEPT[self.x].enter(Cell(params, noise), x), y)
-            return study(here.params, world, here.noise, prior, gate_probability=here.gate_probability)
+            return self.study(key, here.params, world, here.noise, prior, here.gate_probability, **how)
 
         # The random numbers do not depend on the cell, so they are drawn once for all of them.
         row = jax.vmap(cell, in_axes=(0, None))
         return jax.vmap(row, in_axes=(None, 0))(x, y)
+
+    def summed(self, key: jax.Array, counted: jax.Array, *args: Any) -> Totals:
+        """As `Study.summed`."""
+        return self(key, *args, add_up=functools.partial(sum_over_runs, counted=counted))
 
 
 def main(config: SweepConfig) -> dict[str, Any]:
     """Run the sweep, write the report and the figure."""
     out = output_folder(config.out)
     x, y = _grid(config)
-    if config.scenario not in simulate.SCENARIOS:
-        raise ValueError(f"scenario: expected one of {sorted(simulate.SCENARIOS)}, got {config.scenario!r}")
+    scenario = scenario_of(config.scenario)
     if config.runs < 2:
         raise ValueError(f"runs: expected at least 2, which a band needs, got {config.runs}")
     runs = min(config.runs, 50) if config.quick else config.runs
     start(config.compute)
-    scenario = simulate.SCENARIOS[config.scenario]
     scenario = dataclasses.replace(scenario, outliers="outlier_rate" in (config.x, config.y))
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=False)
     noise = simulate.Noise()
@@ -227,13 +218,7 @@ def main(config: SweepConfig) -> dict[str, Any]:
         "consistent_cells": sum(cell["consistent"] for cell in cells),
         "cells": cells,
         "seed": config.seed,
-        "chunk": result.chunk,
-        "devices": result.devices,
-        "processes": result.processes,
-        "resumed_runs": result.resumed_runs,
-        "wall_s": time.perf_counter() - began,
-        "compile_s": result.compile_s,
-        "runs_per_s": (runs - result.resumed_runs) * len(cells) / result.run_s,
+        **how_computed(result, runs, began, per_run=len(cells)),
     }
     if "gate_probability" in (config.x, config.y):
         other = config.y if config.x == "gate_probability" else config.x

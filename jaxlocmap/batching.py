@@ -33,13 +33,13 @@ def _any_in_batch_vmap(axis_size: int, in_batched: list[bool], flags: jax.Array)
     return any_in_batch(flags), False
 
 
-def sum_over_runs(x: jax.Array, counted: jax.Array) -> jax.Array:
-    """The sum of x, any shape, over the runs that are `counted` (() bool), under `vmap(..., axis_name=RUNS)`.
+def sum_over_runs(tree: Any, counted: jax.Array) -> Any:
+    """The sum of arrays over the runs that are `counted` (() bool), under `vmap(..., axis_name=RUNS)`.
 
     It is the same for all runs, so it can be taken inside a loop: what the loop stacks is then one sum a step instead
     of one value a run.
     """
-    return jax.lax.psum(jnp.where(counted, x, 0), RUNS)
+    return jax.tree.map(lambda x: jax.lax.psum(jnp.where(counted, x, 0), RUNS), tree)
 
 
 def zero_like_any(*trees: Any) -> jax.Array:

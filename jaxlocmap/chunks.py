@@ -149,7 +149,7 @@ def trace(run: OneRun) -> Traced:
             return run.function(key, *args)
         if summed := getattr(run.function, "summed", None):
             return summed(key, counted, *args)
-        return jax.tree.map(lambda x: batching.sum_over_runs(_real(x), counted), run.function(key, *args))
+        return batching.sum_over_runs(jax.tree.map(_real, run.function(key, *args)), counted)
 
     counted = jax.ShapeDtypeStruct((), np.bool_)
     jaxpr, outputs = jax.make_jaxpr(one, axis_env=[(batching.RUNS, 1)], return_shape=True)(key, counted, *args)

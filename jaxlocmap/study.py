@@ -7,6 +7,7 @@ report = summarise(totals, config)
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -59,34 +60,16 @@ class Study:
         noise: simulate.Noise,
         prior: Gaussian,
         gate_probability: jax.Array | None = None,
+        *,
+        add_up: Callable[[Any], Any] = lambda own: own,
     ) -> Totals:
         """Totals of the run that `key` stands for.
 
         Args:
             key: of this run. params: the filter's. world, noise, prior: as their fields say.
             gate_probability: takes the place of the configuration's; a value, so that a sweep over gates compiles once.
+            add_up: what becomes of everything that is to be added up over runs, each step's as soon as it is there.
         """
-        return self._run(lambda x: x, key, params, world, noise, prior, gate_probability)
-
-    def summed(self, key: jax.Array, counted: jax.Array, *args: Any, **kwargs: Any) -> Totals:
-        """Under `vmap(..., axis_name=batching.RUNS)`, the totals of all runs that are `counted` (() bool), added up
-        step by step: what `monte_carlo` computes.
-
-        Args:
-            key, *args, **kwargs: as of a call.
-        """
-        return self._run(lambda tree: jax.tree.map(lambda x: sum_over_runs(x, counted), tree), key, *args, **kwargs)
-
-    def _run(
-        self,
-        add_up: Callable[[Any], Any],
-        key: jax.Array,
-        params: Params,
-        world: World,
-        noise: simulate.Noise,
-        prior: Gaussian,
-        gate_probability: jax.Array | None = None,
-    ) -> Totals:
         params.check()
         dtype = prior.mean.dtype
         params, world, noise = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, world, noise))
@@ -154,6 +137,15 @@ class Study:
             log_odds = grid.clamp(log_odds, config.grid)
         of_run = run_totals(steps, sightings, pose, belief, map_totals(log_odds, world, config))
         return Totals(**per_step._asdict(), **add_up(of_run))
+
+    def summed(self, key: jax.Array, counted: jax.Array, *args: Any, **kwargs: Any) -> Totals:
+        """Under `vmap(..., axis_name=batching.RUNS)`, the totals of all runs that are `counted` (() bool), added up
+        step by step: what `monte_carlo` computes.
+
+        Args:
+            key, *args, **kwargs: as of a call.
+        """
+        return self(key, *args, **kwargs, add_up=functools.partial(sum_over_runs, counted=counted))
 
 
 def _mean_over_runs(total_and_square: np.ndarray, runs: int, expected: float) -> consistency.Mean:
