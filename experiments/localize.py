@@ -22,8 +22,8 @@ _PIECE = 2000  # steps between two moves of the progress bar
 # What the program believes of a log that states nothing: wheel commands (spectral density 0.1 m/s and 0.1 rad/s per
 # root second, over periods of 0.1 s) and a camera's landmarks.
 _DEFAULT_NOISE = {"v": 0.1 / 0.1**0.5, "w": 0.1 / 0.1**0.5, "range": 0.15, "bearing": 0.05}
-_PERIOD = 0.1  # s, what Q refers to
-_PRIOR_STD = (0.05, 0.05, 0.05)  # m, m, rad, around the pose to start from
+PERIOD = 0.1  # s, what Q refers to
+PRIOR_STD = (0.05, 0.05, 0.05)  # m, m, rad, around the pose to start from
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,21 +70,21 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
     if config.quick:
         timeline = _first(timeline, _PIECE)
     with jax.enable_x64(True):
-        params = params_or(config.params, _believed(log))
+        params = params_or(config.params, believed(log))
         settings = Config(
-            dt=_PERIOD, motion=config.motion, gate_probability=config.gate, sensor_offset=_offset(log.sensor_offset)
+            dt=PERIOD, motion=config.motion, gate_probability=config.gate, sensor_offset=offset_of(log.sensor_offset)
         )
-        start = _first_pose(log, timeline) if config.start is None else np.array(config.start)
-        prior = Gaussian(jnp.asarray(start), jnp.diag(jnp.array(_PRIOR_STD) ** 2))
+        start = first_pose(log, timeline) if config.start is None else np.array(config.start)
+        prior = Gaussian(jnp.asarray(start), jnp.diag(jnp.array(PRIOR_STD) ** 2))
         CONSOLE.print(f"{len(timeline.time)} steps of {log.name}; compiling takes some seconds")
-        info = _run(params, prior, timeline.inputs, log.landmarks, settings)
-        report = _judge(log, timeline, info, settings)
+        info = filter_log(params, prior, timeline.inputs, log.landmarks, settings)
+        report = judge(log, timeline, info, settings)
     report["params"] = {name: np.asarray(value).tolist() for name, value in params._asdict().items()}
     _write(out, log, timeline, info, report)
     return report
 
 
-def _first_pose(log: Log, timeline: Timeline) -> np.ndarray:
+def first_pose(log: Log, timeline: Timeline) -> np.ndarray:
     if not timeline.truth_valid[0]:
         raise ValueError(
             f"start: {log.name} has no truth at its first step, {timeline.time[0]:.3f} s: expected a pose X Y THETA"
@@ -92,7 +92,7 @@ def _first_pose(log: Log, timeline: Timeline) -> np.ndarray:
     return timeline.truth[0]
 
 
-def _offset(offset: np.ndarray) -> tuple[float, float, float]:
+def offset_of(offset: np.ndarray) -> tuple[float, float, float]:
     dx, dy, dtheta = (float(x) for x in offset)
     return dx, dy, dtheta
 
@@ -103,7 +103,7 @@ def _first(timeline: Timeline, steps: int) -> Timeline:
     return cut._replace(counts=timeline.counts)
 
 
-def _believed(log: Log) -> Params:
+def believed(log: Log) -> Params:
     stated = log.stated_variance
     deviations = _DEFAULT_NOISE if stated is None else {name: value**0.5 for name, value in stated.items()}
     return Params.from_std(**deviations)
@@ -114,7 +114,7 @@ def _piece(params: Params, state: State, inputs: Inputs, landmarks: jax.Array, *
     return run(params, state, inputs, landmarks=landmarks, config=config)
 
 
-def _run(params: Params, prior: Gaussian, inputs: Inputs, landmarks: np.ndarray, config: Config) -> Info:
+def filter_log(params: Params, prior: Gaussian, inputs: Inputs, landmarks: np.ndarray, config: Config) -> Info:
     """`run`, in equal pieces so that a bar can move. The last is filled up with steps of no time and no sightings,
     which change nothing.
     """
@@ -131,7 +131,7 @@ def _run(params: Params, prior: Gaussian, inputs: Inputs, landmarks: np.ndarray,
     return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:steps], *reports)
 
 
-def _judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str, Any]:
+def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str, Any]:
     valid = timeline.inputs.valid
     observations = int(valid.sum())
     rate = float(info.accepted.sum()) / observations if observations else float("nan")
@@ -151,7 +151,7 @@ def _judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str
         "counts": timeline.counts,
         "truth_share": float(timeline.truth_valid.mean()),
     }
-    nees, error = _score(timeline, info)
+    nees, error = score(timeline, info)
     scored = nees[np.isfinite(nees)]
     if not len(scored):
         nothing = ("rmse_position_m", "rmse_yaw_rad", "anees", "anees_at_sightings", "nees_median")
@@ -171,7 +171,7 @@ def _judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str
     }
 
 
-def _score(timeline: Timeline, info: Info) -> tuple[np.ndarray, np.ndarray]:
+def score(timeline: Timeline, info: Info) -> tuple[np.ndarray, np.ndarray]:
     """NEES (T,) and pose errors (T, 3), NaN where there is no truth."""
     error = jax.vmap(consistency.pose_error)(jnp.asarray(timeline.truth), jnp.asarray(info.belief.mean))
     nees = jax.vmap(consistency.nees)(error, jnp.asarray(info.belief.cov))

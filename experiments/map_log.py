@@ -57,12 +57,9 @@ def main(config: MapLogConfig) -> dict[str, Any]:
     if not len(log.scan_time) or not len(log.truth_time):
         raise ValueError(f"{config.log}: expected laser scans with poses, got {len(log.scan_time)} scans")
     if config.quick:
-        log = dataclasses.replace(
-            log,
-            **{name: getattr(log, name)[:_PIECE] for name in ("scan_time", "scan", "truth_time", "truth")},
-        )
+        log = first_scans(log, _PIECE)
     params = params_or(config.params, course_params())
-    spec = _extent(log, config)
+    spec = extent(log, config)
     settings = Config(grid=spec, min_range=0.05, max_range=config.max_range)
     CONSOLE.print(
         f"{len(log.scan)} scans of {log.scan.shape[1]} beams onto {spec.shape[0]} x {spec.shape[1]} cells",
@@ -111,7 +108,13 @@ def main(config: MapLogConfig) -> dict[str, Any]:
     return report
 
 
-def _extent(log: Log, config: MapLogConfig) -> GridSpec:
+def first_scans(log: Log, count: int) -> Log:
+    """The same log, cut short."""
+    cut = {name: getattr(log, name)[:count] for name in ("scan_time", "scan", "truth_time", "truth")}
+    return dataclasses.replace(log, **cut)
+
+
+def extent(log: Log, config: MapLogConfig) -> GridSpec:
     """A grid that holds the path and every point hit, with a margin, its origin on a whole cell."""
     angles = log.truth[:, 2:] + log.beam_angles
     hit = np.isfinite(log.scan) & (log.scan < config.max_range)

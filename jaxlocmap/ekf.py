@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import scipy.special
 
 from jaxlocmap import checks
-from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve, stack
+from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve, stack, values
 from jaxlocmap.motion import MotionModel, wrap
 
 
@@ -124,32 +124,98 @@ def update(
     m = len(residual)
     for name, value, shape in (("mean", mean, (3,)), ("cov", cov, (3, 3)), ("H", H, (m, 3)), ("R", R, (m, m))):
         checks.shape(name, value, shape)
-    H, P, noise = Matrix.of(H), Matrix.symmetric(cov), Matrix.symmetric(R)
     r = tuple(residual[i] for i in range(m))
-    S = sandwich(H, P) + noise
-    L, D = ldl(S)
-    definite = functools.reduce(jnp.logical_and, [(d > 0) & (d < jnp.inf) for d in D])
-    distance: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
-    nis = jnp.where(definite, distance, jnp.nan)
-    log_det = sum(jnp.log(d) for d in D)
-    log_likelihood = -0.5 * (nis + log_det + m * math.log(2 * math.pi))
+    P = Matrix.symmetric(cov)
+    corrected = _correct(P, Matrix.of(H), Matrix.symmetric(R), r)
+    shift, nis = corrected.shift, corrected.nis
     accepted = jnp.logical_and(nis < threshold, valid)  # what is no number is not below, with or without a gate
-
-    K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)  # S is symmetric: row i of K solves S k = (P Hᵀ)_i
-    IKH = Matrix.identity(len(P.rows)) - K @ H
-    joseph = sandwich(IKH, P) + sandwich(K, noise)
-    shift = K @ Matrix([x] for x in r)
-    moved = mean[0] + shift[0, 0], mean[1] + shift[1, 0], wrap(mean[2] + shift[2, 0])
+    moved = mean[0] + shift[0], mean[1] + shift[1], wrap(mean[2] + shift[2])
 
     def chosen(new: Any, old: Any) -> list[jax.Array]:
         return [jnp.where(accepted, x, y) for x, y in zip(new, old, strict=True)]
 
     return Update(
         mean=stack(chosen(moved, mean)),
-        cov=stack([chosen(new, old) for new, old in zip(joseph.rows, P.rows, strict=True)]),
+        cov=stack([chosen(new, old) for new, old in zip(corrected.cov, P.rows, strict=True)]),
         innovation=residual,
-        S=S.array(cov.dtype),
+        S=Matrix(corrected.S).array(cov.dtype),
         nis=nis,
         accepted=accepted,
-        log_likelihood=log_likelihood,
+        log_likelihood=corrected.log_likelihood,
     )
+
+
+class _Corrected(NamedTuple):
+    """What an observation makes of a belief, before the gate is asked."""
+
+    shift: tuple[Any, ...]  # of the mean
+    cov: tuple[tuple[Any, ...], ...]  # rows
+    S: tuple[tuple[Any, ...], ...]  # rows
+    nis: Any
+    log_likelihood: Any
+
+
+def _correct(P: Matrix, H: Matrix, R: Matrix, r: tuple[Any, ...]) -> _Corrected:
+    """The correction of `update`, with derivatives written by hand.
+
+    With e = S⁻¹ r and A = I - K H,
+
+        dS = H dP Hᵀ + dH P Hᵀ + (dH P Hᵀ)ᵀ + dR
+        d(K r) = dP Hᵀ e + P dHᵀ e + K (dr - dS e)
+        dP⁺ = A dP Aᵀ + K dR Kᵀ - K dH P Aᵀ - (K dH P Aᵀ)ᵀ
+        d(d²) = 2 eᵀ dr - eᵀ dS e,   d log|S| = tr(S⁻¹ dS)
+
+    There is no dK: the Joseph form is smallest at the gain it is taken at, so to first order it does not change with
+    it. That, and no derivative of a division, is what makes this cheaper than differentiating the code. Source: Gupta
+    & Mehra 1974.
+    """
+    m, (entries, rebuild) = len(r), values((P.rows, H.rows, R.rows, r))
+
+    def gain(P: Matrix, H: Matrix, R: Matrix) -> tuple[Matrix, Matrix, tuple[Any, ...], Matrix, Matrix]:
+        S = sandwich(H, P) + R
+        L, D = ldl(S)
+        K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)  # S is symmetric: row i of K solves S k = (P Hᵀ)_i
+        return S, L, D, K, Matrix.identity(len(P.rows)) - K @ H
+
+    @jax.custom_jvp
+    def correct(entries: list[Any]) -> _Corrected:
+        P, H, R, r = matrices(rebuild(entries))
+        S, L, D, K, A = gain(P, H, R)
+        definite = functools.reduce(jnp.logical_and, [(d > 0) & (d < jnp.inf) for d in D])
+        distance: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
+        nis = jnp.where(definite, distance, jnp.nan)
+        log_det = sum(jnp.log(d) for d in D)
+        return _Corrected(
+            shift=column(K @ Matrix([x] for x in r)),
+            cov=(sandwich(A, P) + sandwich(K, R)).rows,
+            S=S.rows,
+            nis=nis,
+            log_likelihood=-0.5 * (nis + log_det + m * math.log(2 * math.pi)),
+        )
+
+    @correct.defjvp
+    def _(primals: Any, tangents: Any) -> tuple[_Corrected, _Corrected]:
+        P, H, R, r = matrices(rebuild(*primals))
+        dP, dH, dR, dr = matrices(rebuild(*tangents, structure=0))
+        _, L, D, K, A = gain(P, H, R)
+        e = solve(L, D, r)
+        E = Matrix([x] for x in e)
+        through_H = dH @ (P @ H.T)
+        dS = sandwich(H, dP) + through_H + through_H.T + dR
+        pull = column(dS @ E)
+        through_A = K @ dH @ (P @ A.T)
+        d_nis = sum(x * (2 * y - z) for x, y, z in zip(e, dr, pull, strict=True))
+        d_log_det = sum(solve(L, D, dS.T.rows[i])[i] for i in range(m))
+        d_shift = dP @ (H.T @ E) + P @ (dH.T @ E) + K @ Matrix([y - z] for y, z in zip(dr, pull, strict=True))
+        d_cov = sandwich(A, dP) + sandwich(K, dR) - through_A - through_A.T
+        tangent = _Corrected(column(d_shift), d_cov.rows, dS.rows, d_nis, -0.5 * (d_nis + d_log_det))
+        return correct(*primals), tangent
+
+    def matrices(rows: Any) -> tuple[Matrix, Matrix, Matrix, tuple[Any, ...]]:
+        P, H, R, r = rows
+        return Matrix(P), Matrix(H), Matrix(R), r
+
+    def column(matrix: Matrix) -> tuple[Any, ...]:
+        return tuple(row[0] for row in matrix.rows)
+
+    return correct(entries)

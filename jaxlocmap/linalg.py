@@ -7,6 +7,7 @@ Entries that are the Python integers 0, 1 and -1 are structure: products with th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -113,6 +114,22 @@ class Matrix:
     def scale(self, factor: Scalar) -> Matrix:
         """Every entry times a scalar."""
         return Matrix([_mul(factor, x) for x in row] for row in self.rows)
+
+
+def values(tree: Any) -> tuple[list[Scalar], Callable[..., Any]]:
+    """The entries of a tree of rows that are no structure, and the way back: `rebuild(entries)` puts others in their
+    place, and `rebuild(tangents, structure=0)` makes the tangent, in which structure does not move.
+    """
+    leaves, form = jax.tree.flatten(tree)
+
+    def rebuild(entries: list[Scalar], structure: int | None = None) -> Any:
+        following = iter(entries)
+        return jax.tree.unflatten(
+            form,
+            [(x if structure is None else structure) if isinstance(x, int) else next(following) for x in leaves],
+        )
+
+    return [x for x in leaves if not isinstance(x, int)], rebuild
 
 
 def sandwich(A: Matrix, P: Matrix) -> Matrix:

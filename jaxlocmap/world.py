@@ -32,6 +32,19 @@ def room() -> World:
     )
 
 
+def random_room(key: jax.Array) -> World:
+    """`room` with its box elsewhere, its sides 1 to 4 m long. The same landmarks."""
+    plain = room()
+    low, high, margin = 0.0, 12.0, 0.5
+    sizes, places = jax.random.uniform(key, (2, 2), plain.segments.dtype)
+    size = 1 + 3 * sizes
+    corner = low + margin + places * (high - low - 2 * margin - size)
+    x, y = (jnp.stack([corner[i], corner[i] + size[i]]) for i in (0, 1))
+    ring = jnp.stack([jnp.stack([x[i], y[j]]) for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    box = jnp.stack([ring, jnp.roll(ring, -1, axis=0)], axis=1)
+    return plain._replace(segments=jnp.concatenate([plain.segments[:4], box]))
+
+
 def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_range: float) -> jax.Array:
     """Distance along each beam to the nearest wall, `max_range` where there is none.
 

@@ -1,0 +1,330 @@
+"""Tune the noise a filter believes in, or the inverse sensor model of its map, from simulated drives or a real log:
+params.json, the evidence on what was held out, and how sure it all is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import optax
+from common import CONSOLE, command_line, output_folder, saved, write_report
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from tune_sources import Source, Wanted, from_robots, from_scans, from_scenario
+
+from jaxlocmap import Params, hosts, plotting, tuning
+from jaxlocmap.consistency import readable
+
+
+@dataclasses.dataclass(frozen=True)
+class TuneConfig:
+    """What to tune, on what, and what for."""
+
+    scenario: Literal["capstone", "loop"] = "capstone"
+    """Simulated drives to tune on, unless there is a log."""
+    log: Path | None = None
+    """A log to tune on: a file for woods and carmen, a folder for mrclam."""
+    format: Literal["woods", "mrclam", "carmen"] | None = None
+    """How the log is written."""
+    robots: tuple[int, ...] = (1, 2, 3)
+    """Which robots of an mrclam log to tune on."""
+    judged: tuple[int, ...] = (4, 5)
+    """Which robots of an mrclam log to judge the result by."""
+    loss: tuple[str, ...] = ("innovation",)
+    """innovation, pose, state, nees, nis, map; several with weights: pose=1 nees=0.5."""
+    tune: tuple[str, ...] | None = None
+    """Which of v, w, v_w, range, bearing, range_bearing, l_occ, l_free; by default what the losses depend on, with Q
+    and R diagonal."""
+    full: bool = False
+    """Q and R with their correlations."""
+    params: Path | None = None
+    """JSON file to start from; by default the course's values, what the log states, or what fits the format."""
+    motion: Literal["arc", "euler", "capstone"] = "arc"
+    """The filter's motion model."""
+    runs: int = 512
+    """Simulated runs to tune on."""
+    judge_runs: int = 2000
+    """Fresh runs to judge by."""
+    gate: float | None = 0.9999
+    """The gate while tuning. It should refuse what is surely false: no derivative sees its decision, and one that also
+    refuses a good reading in a hundred pulls the result by some per cent."""
+    judge_gate: float | None = 0.99
+    """The gate the result is judged with."""
+    max_range: float | None = None
+    """Sightings at or beyond are left out, m; of a laser, where its beams end (20 m by default)."""
+    resolution: float = 0.1
+    """Side of a cell of a carmen log's map, m."""
+    optimiser: Literal["lbfgs", "adam"] = "lbfgs"
+    """L-BFGS on everything at every step, or Adam, which also goes with --minibatch."""
+    minibatch: int | None = None
+    """Sequences a step of Adam; all by default."""
+    epochs: int = 20
+    """At most so many; after each the loss on sequences left aside is taken."""
+    seed: int = 0
+    """Of all randomness."""
+    out: Path = Path("out/tune")
+    """Folder for params.json, report.json and the figures."""
+    quick: bool = False
+    """A run of a few seconds."""
+
+
+_DEPENDS = {"map": tuning.SENSOR_MODEL}
+_STEPS = {"lbfgs": 2, "adam": 20}  # an epoch
+_LOSS_WORDS = {
+    "innovation": "negative log-likelihood of an innovation, nats",
+    "pose": "negative log density of the true pose, nats",
+    "state": "squared error of the pose, m²",
+    "nees": "distance of the NEES from χ(3)",
+    "nis": "distance of the NIS from χ(2)",
+    "map": "log-loss of the next scan's cells, nats",
+}
+
+
+def main(config: TuneConfig) -> dict[str, Any]:
+    """Tune, judge before and after, write the parameters, the report and the figures."""
+    began = time.perf_counter()
+    out = output_folder(config.out)
+    weights = _weights(config.loss)
+    losses = tuple(name for name, _ in weights)
+    hosts.use_all_cores()
+    with jax.enable_x64(True):
+        source = _source(config, losses)
+        objective = tuning.Objective(source.config, weights)
+        tuned = _tuned(config, losses)
+        CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds", highlight=False)
+        found = _fit(config, objective, source, tuned, out)
+        CONSOLE.print("judging what was held out, before and after; standard errors", highlight=False)
+        sure = tuning.certainty(objective, found.params, source.compared, tuned)
+        report = {
+            "source": source.name,
+            "losses": dict(weights),
+            "parameters": _parameters(source.start, found.params, sure),
+            "correlation": dict(names=list(sure.names), matrix=sure.correlation.tolist()),
+            "not_identified": list(sure.words),
+            "loss": _losses(objective, source, found.params),
+            **_descent(config, found),
+        }
+        before, after = source.evidence(source.start), source.evidence(found.params)
+    files = _figures(out, source, report, before, after)
+    report["held_out"] = {"before": _for_report(before), "after": _for_report(after)}
+    report |= {"seed": config.seed, "wall_s": time.perf_counter() - began}
+    found.params.save(out / "params.json")
+    write_report(out, report)
+    _print(report)
+    saved(out, "params.json", "report.json", *files)
+    return report
+
+
+def _source(config: TuneConfig, losses: tuple[str, ...]) -> Source:
+    start = None if config.params is None else Params.load(config.params)
+    wanted = Wanted(losses, start, config.gate, config.judge_gate, config.seed, config.quick)
+    if (config.log is None) != (config.format is None):
+        raise ValueError(f"log, format: expected both or neither, got {config.log} and {config.format}")
+    if config.log is None:
+        for name in ("runs", "judge_runs"):
+            if getattr(config, name) < 2:
+                raise ValueError(f"{name}: expected at least 2, got {getattr(config, name)}")
+        runs, judge_runs = (32, 100) if config.quick else (config.runs, config.judge_runs)
+        return from_scenario(config.scenario, config.motion, runs, judge_runs, wanted)
+    if config.format == "carmen":
+        return from_scans(config.log, config.resolution, config.max_range or 20.0, wanted)
+    if "map" in losses:
+        raise ValueError(f"loss: expected none of a map, for the format {config.format} has no scans, got `map`")
+    kind, robots = str(config.format), config.robots
+    return from_robots(config.log, kind, robots, config.judged, config.motion, config.max_range, wanted)
+
+
+def _weights(losses: tuple[str, ...]) -> tuple[tuple[str, float], ...]:
+    weights = []
+    for loss in losses:
+        name, _, weight = loss.partition("=")
+        try:
+            weights.append((name, float(weight or 1)))
+        except ValueError:
+            raise ValueError(f"loss: expected NAME or NAME=WEIGHT, got {loss!r}") from None
+    return tuple(weights)
+
+
+def _tuned(config: TuneConfig, losses: tuple[str, ...]) -> tuple[str, ...]:
+    if config.tune is not None:
+        return config.tune
+    noise = tuning.FULL_NOISE if config.full else tuning.NOISE
+    names = [name for loss in losses for name in _DEPENDS.get(loss, noise)]
+    return tuple(name for name in tuning.NAMES if name in names)
+
+
+def _fit(
+    config: TuneConfig, objective: tuning.Objective, source: Source, tuned: tuple[str, ...], out: Path
+) -> tuning.Fit:
+    adam = config.optimiser == "adam"
+    if config.minibatch is not None and not adam:
+        raise ValueError(
+            f"minibatch: L-BFGS wants everything at every step: expected --optimiser adam, got {config.optimiser}"
+        )
+    epochs = min(config.epochs, 2) if config.quick else config.epochs
+    with _bar(epochs, tuned, out) as progress:
+        return tuning.fit(
+            objective,
+            source.start,
+            source.train,
+            tuned=tuned,
+            optimiser=optax.adam(0.05) if adam else None,
+            epochs=epochs,
+            steps=_STEPS[config.optimiser],
+            minibatch=config.minibatch,
+            key=jax.random.key(config.seed),
+            validation=source.validation,
+            progress=progress,
+        )
+
+
+@contextmanager
+def _bar(epochs: int, tuned: tuple[str, ...], out: Path) -> Iterator[Callable[[tuning.Fit], None]]:
+    """A bar with the loss and the parameters; the best so far is on disk after every epoch."""
+    columns = (TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=CONSOLE, transient=True) as bar:
+        task = bar.add_task("tuning", total=epochs)
+
+        def move(fit: tuning.Fit) -> None:
+            fit.params.save(out / "params.json")
+            best = tuning.natural(fit.params)
+            values = ", ".join(f"{name} {float(best[name]):.4g}" for name in tuned)
+            bar.update(task, completed=len(fit.losses) - 1, description=f"loss {fit.loss:.5g}: {values}")
+
+        yield move
+
+
+def _parameters(start: Params, end: Params, sure: tuning.Certainty) -> dict[str, dict[str, Any]]:
+    before, after = tuning.natural(start), tuning.natural(end)
+    return {
+        name: {
+            "start": float(before[name]),
+            "end": float(after[name]),
+            "standard_error": float(error),
+            "unit": tuning.UNITS[name],
+        }
+        for name, error in zip(sure.names, sure.standard_error, strict=True)
+    }
+
+
+def _losses(objective: tuning.Objective, source: Source, end: Params) -> dict[str, dict[str, Any]]:
+    judge = jax.jit(objective)
+    rows: dict[str, dict[str, Any]] = {name: {} for name in objective.names}
+    for when, params in (("before", source.start), ("after", end)):
+        for which, batch in (("train", source.train), ("validation", source.validation)):
+            terms = {} if batch is None else judge(params, batch)[1]
+            for name in rows:
+                rows[name][f"{which}_{when}"] = float(terms[name]) if name in terms else None
+    return rows
+
+
+def _descent(config: TuneConfig, found: tuning.Fit) -> dict[str, Any]:
+    trace = found.trace
+    return {
+        "loss_words": "; ".join(_LOSS_WORDS[name] for name, _ in _weights(config.loss)),
+        "evaluations": int(trace.evaluations.sum()),
+        "skipped_steps": int(trace.skipped.sum()),
+        "stopped_early": found.stopped_early,
+        "best_epoch": found.best_epoch,
+        "steps_per_epoch": _STEPS[config.optimiser],
+        "compile_s": found.compile_s,
+        "run_s": found.run_s,
+        "trace": {
+            "loss": trace.loss,
+            "gradient_norm": trace.gradient_norm,
+            "validation": found.losses,
+            "parameters": trace.params,
+        },
+    }
+
+
+def _figures(out: Path, source: Source, report: dict[str, Any], before: Any, after: Any) -> list[str]:
+    plotting.descent_figure(out / "descent.png", report | {"validated": source.validation is not None})
+    files = ["descent.png"]
+    if "one_scan_ahead" in after:
+        plotting.calibration_figure(
+            out / "calibration.png", before["one_scan_ahead"], after["one_scan_ahead"], source.name
+        )
+        files.append("calibration.png")
+    if "nees_per_step" in after:
+        plotting.study_before_after_figure(out / "nees.png", before, after, source.dt)
+        files.append("nees.png")
+    drives = {
+        name: {
+            "time": after[name]["time"],
+            "before": before[name],
+            "after": after[name],
+            "nees_before": before[name]["nees"],
+            "nees_after": after[name]["nees"],
+        }
+        for name in after
+        if isinstance(after[name], dict) and after[name].get("anees") is not None
+    }
+    if drives:
+        plotting.log_before_after_figure(out / "nees.png", drives)
+        files.append("nees.png")
+    return files
+
+
+def _for_report(evidence: dict[str, Any]) -> dict[str, Any]:
+    """Without the long arrays of a log."""
+    return {
+        name: {key: item for key, item in value.items() if key not in ("nees", "time")}
+        if isinstance(value, dict)
+        else value
+        for name, value in evidence.items()
+    }
+
+
+_SHOWN = (
+    ("anees", "ANEES (3)"),
+    ("nees_median", "median NEES (2.37)"),
+    ("nis_mean", "NIS (2)"),
+    ("coverage_95", "95 % ellipsoid holds"),
+    ("gate_accept_rate", "gate lets in"),
+    ("rmse_position_m", "position RMSE [m]"),
+    ("rmse_yaw_rad", "yaw RMSE [rad]"),
+    ("log_loss", "log-loss one scan ahead [nats]"),
+    ("calibration_error", "calibration error one scan ahead"),
+)
+
+
+def _print(report: dict[str, Any]) -> None:
+    table = Table("parameter", "start", "end", "standard error", title=report["source"], title_justify="left")
+    for name, value in report["parameters"].items():
+        error = value["standard_error"]
+        table.add_row(f"{name} [{value['unit']}]", f"{value['start']:.4g}", f"{value['end']:.4g}", f"{error:.2g}")
+    CONSOLE.print(table)
+    table = Table("held out", "quantity", "before", "after")
+    before, after = report["held_out"]["before"], report["held_out"]["after"]
+    groups = {"fresh runs": (before, after)} if "anees" in after else {}
+    groups |= {name: (before[name], after[name]) for name, x in after.items() if isinstance(x, dict)}
+    for group, (old, new) in groups.items():
+        for key, words in _SHOWN:
+            if new.get(key) is not None and old.get(key) is not None:
+                table.add_row(group.replace("_", " "), words, readable(old[key], 4), readable(new[key], 4))
+    CONSOLE.print(table)
+    for name, rows in report["loss"].items():
+        pairs = [
+            f"{which}: {rows[f'{which}_before']:.4f} → {rows[f'{which}_after']:.4f}"
+            for which in ("train", "validation")
+            if rows[f"{which}_before"] is not None
+        ]
+        CONSOLE.print(f"loss {name}, {_LOSS_WORDS[name]}: {'; '.join(pairs)}", highlight=False)
+    for sentence in report["not_identified"]:
+        CONSOLE.print(f"not identified: {sentence}", highlight=False)
+    CONSOLE.print(
+        f"{report['evaluations']} evaluations in {report['run_s']:.1f} s after {report['compile_s']:.1f} s of "
+        f"compilation; {report['skipped_steps']} steps skipped as not finite",
+        highlight=False,
+    )
+
+
+if __name__ == "__main__":
+    command_line(main, TuneConfig)

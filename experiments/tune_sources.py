@@ -1,0 +1,257 @@
+"""What tune.py tunes on and what it judges the result by: a scenario, or the logs of real robots."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from common import scenario_of
+from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of
+from map_log import MapLogConfig, extent, first_scans
+
+from jaxlocmap import Config, Gaussian, Params, simulate, tuning
+from jaxlocmap.foresight import Foresight, foresee
+from jaxlocmap.logs import Log, Timeline, read, to_timeline
+from jaxlocmap.monte_carlo import monte_carlo
+from jaxlocmap.study import Study, summarise
+from jaxlocmap.world import random_room
+
+Evidence = dict[str, Any]
+_HELD_OUT_WORLDS = 64
+_BLOCKS = 10  # of the scans of one map, for its standard errors
+
+# Steps that count in a window, and steps before them in which the filter forgets its start: 30 s each on woods, where
+# the filter remembers some 5 s; 45 s and 30 s on mrclam, where sightings are far between.
+_WINDOWS = {"woods": (300, 300), "mrclam": (3000, 2000)}
+
+
+class Source(NamedTuple):
+    """Sequences and settings."""
+
+    name: str
+    start: Params
+    config: Config  # while tuning
+    train: tuning.Batch
+    validation: tuning.Batch | None
+    compared: tuning.Batch  # sequences independent of each other, whose spread makes the standard errors
+    evidence: Callable[[Params], Evidence]  # of parameters, on what is held out
+    dt: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """What the command line asks of a source."""
+
+    losses: tuple[str, ...]
+    start: Params | None
+    gate: float | None  # while tuning
+    judge_gate: float | None
+    seed: int
+    quick: bool
+
+
+def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wanted) -> Source:
+    """Simulated drives: `runs` to tune on, a quarter as many to pick the best by, and fresh ones to judge.
+
+    With the loss `map`, rooms are drawn anew for every run, so that those judged are not those tuned on.
+    """
+    scenario, noise = scenario_of(name), simulate.Noise()
+    mapping = "map" in wanted.losses
+    config = scenario.config(motion=motion, gate_probability=wanted.gate, grid=mapping)
+    key = jax.random.key(wanted.seed)
+
+    def drives(i: int, count: int) -> tuning.Batch:
+        drives_key, rooms_key = jax.random.split(jax.random.fold_in(key, i))
+        rooms = jax.vmap(random_room)(jax.random.split(rooms_key, count)) if mapping else simulate.room()
+        return tuning.simulated(drives_key, count, rooms, noise, scenario=scenario, scans=mapping, worlds=mapping)
+
+    held_out = drives(2, min(judge_runs, _HELD_OUT_WORLDS)) if mapping else None
+    study_config = scenario.config(motion=motion, gate_probability=wanted.judge_gate, grid=mapping)
+    study_runs = min(judge_runs, 200) if mapping else judge_runs
+
+    def evidence(params: Params) -> Evidence:
+        args = params, simulate.room(), noise, scenario.prior()
+        args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), args)
+        totals = monte_carlo(Study(scenario, study_config), jax.random.fold_in(key, 3), study_runs, *args)
+        report = summarise(totals.value, study_config)
+        if held_out is not None:
+            judged = dataclasses.replace(config, gate_probability=wanted.judge_gate)
+            report["one_scan_ahead"] = _foresight(params, held_out, judged)
+        return report
+
+    train = drives(0, runs)
+    # Where only the map is tuned the simulated robot knows its own noise: the map is to be judged, not the pose.
+    own = simulate.own_params(noise, scenario.dt)
+    start = simulate.course_params()
+    if wanted.losses == ("map",):
+        start = own._replace(l_occ=start.l_occ, l_free=start.l_free)
+    return Source(
+        f"{name}, {motion} motion, {runs} runs",
+        wanted.start or start,
+        config,
+        train,
+        drives(1, max(runs // 4, 1)),
+        train,
+        evidence,
+        scenario.dt,
+    )
+
+
+def from_robots(
+    path: Path,
+    kind: str,
+    robots: tuple[int, ...],
+    judged: tuple[int, ...],
+    motion: str,
+    max_range: float | None,
+    wanted: Wanted,
+) -> Source:
+    """Logs of robots among landmarks. woods: the first half to tune on, the second to judge. mrclam: whole robots."""
+    if kind == "woods":
+        log, timeline = _timeline(path, kind, None, max_range, wanted.quick)
+        half = len(timeline.time) // 2
+        drives = [(log, _cut(timeline, 0, half))]
+        held_out = {"second half": (log, _cut(timeline, half, None))}
+    else:
+        if not robots or set(robots) & set(judged):
+            raise ValueError(
+                f"robots, judged: expected robots to tune on and others to judge, got {robots} and {judged}"
+            )
+        drives = [_timeline(path, kind, robot, max_range, wanted.quick) for robot in robots]
+        held_out = {f"robot {robot}": _timeline(path, kind, robot, max_range, wanted.quick) for robot in judged}
+    log = drives[0][0]
+    config = Config(dt=PERIOD, motion=motion, gate_probability=wanted.gate, sensor_offset=offset_of(log.sensor_offset))
+    start = wanted.start or believed(log)
+    length, run_in = _WINDOWS[kind]
+    cut = tuning.join(*(_windows(timeline, log, start, config, length, run_in) for log, timeline in drives))
+    some = np.arange(len(cut.counted)) % 5 == 4
+    train, validation = tuning.pick(cut, ~some), tuning.pick(cut, some) if some.any() else None
+    judged_config = dataclasses.replace(config, gate_probability=wanted.judge_gate)
+
+    def evidence(params: Params) -> Evidence:
+        return {name: _judged(params, *drive, judged_config) for name, drive in held_out.items()}
+
+    said = f"{path.name}" + (f", robots {', '.join(map(str, robots))}" if kind == "mrclam" else ", first half")
+    return Source(said, start, config, train, validation, cut, evidence, PERIOD)
+
+
+def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) -> Source:
+    """A laser log with poses: the first half of the scans to tune on, of which every fifth run of scans picks the best,
+    the second half to judge, mapped onto what the first has left.
+    """
+    if wanted.losses != ("map",):
+        raise ValueError(f"loss: a carmen log has no landmarks: expected `map` alone, got {', '.join(wanted.losses)}")
+    log = read(path, "carmen")
+    scans = min(len(log.scan), 60) if wanted.quick else len(log.scan)
+    log = first_scans(log, scans)
+    spec = extent(log, MapLogConfig(log=path, format="carmen", resolution=resolution, max_range=max_range))
+    config = Config(grid=spec, min_range=0.05, max_range=max_range)
+    half = scans // 2
+    whole = _scans(log, scans)
+    first = _scans(log, half)
+    number = np.arange(half) // max(half // 25, 1)
+    train, validation = (
+        first._replace(counted=(number % 5 != 4)[None]),
+        first._replace(counted=(number % 5 == 4)[None]),
+    )
+    later = whole._replace(counted=(np.arange(scans) >= half)[None])
+    return Source(
+        f"{path.name}, first {half} of {scans} scans",
+        wanted.start or simulate.course_params(),
+        config,
+        train,
+        validation,
+        tuning.blocks(train, min(_BLOCKS, half // 2)),
+        lambda params: {"one_scan_ahead": _foresight(params, later, config)},
+        1.0,
+    )
+
+
+def _scans(log: Log, count: int) -> tuning.Batch:
+    inputs = tuning.no_observations(count)._replace(ranges=log.scan[:count])
+    prior = Gaussian(log.truth[0], np.diag(np.array(PRIOR_STD) ** 2))
+    return tuning.sequence(inputs, prior, beam_angles=log.beam_angles, poses=log.truth[:count])
+
+
+def _timeline(path: Path, kind: str, robot: int | None, max_range: float | None, quick: bool) -> tuple[Log, Timeline]:
+    log = read(path, kind, robot)
+    if not len(log.landmarks):
+        raise ValueError(f"{path}: expected landmarks to localise by, got none (format {kind})")
+    if not len(log.truth_time):
+        raise ValueError(f"{path}: expected a log with truth, to start from and to judge by, got none")
+    timeline = to_timeline(log, max_range=max_range, start=float(log.truth_time.min()))
+    return log, _cut(timeline, 0, 6000 if kind == "mrclam" else 2400) if quick else timeline
+
+
+def _cut(timeline: Timeline, begin: int, end: int | None) -> Timeline:
+    return jax.tree.map(lambda x: x[begin:end], timeline._replace(counts={}))
+
+
+def _prior(pose: np.ndarray) -> Gaussian:
+    return Gaussian(jnp.asarray(pose), jnp.diag(jnp.array(PRIOR_STD) ** 2))
+
+
+def _windows(timeline: Timeline, log: Log, start: Params, config: Config, length: int, run_in: int) -> tuning.Batch:
+    """Windows that start at the truth where it is known, and elsewhere where the filter believes to be."""
+    whole = tuning.sequence(
+        timeline.inputs,
+        _prior(first_pose(log, timeline)),
+        landmarks=log.landmarks,
+        truth=timeline.truth,
+        known=timeline.truth_valid,
+    )
+    mean = np.where(timeline.truth_valid[:, None], timeline.truth, 0)[None]
+    if not timeline.truth_valid.all():
+        means = np.asarray(jax.jit(tuning.beliefs, static_argnames="config")(start, whole, config=config).mean)
+        mean = np.where(timeline.truth_valid[:, None], mean, means)
+    cov = np.broadcast_to(np.diag(np.array(PRIOR_STD) ** 2), (*mean.shape, 3))
+    return tuning.windows(whole, length, run_in=run_in, beliefs=Gaussian(mean, cov))
+
+
+def _judged(params: Params, log: Log, timeline: Timeline, config: Config) -> Evidence:
+    info = filter_log(params, _prior(first_pose(log, timeline)), timeline.inputs, log.landmarks, config)
+    report = judge(log, timeline, info, config)
+    return report | {"time": timeline.time}
+
+
+def _foresight(params: Params, batch: tuning.Batch, config: Config) -> Evidence:
+    """Log-loss and calibration one scan ahead."""
+    spec = config.grid
+    poses = batch.poses if batch.poses is not None else tuning.beliefs(params, batch, config=config).mean
+    if spec is None or batch.inputs.ranges is None:
+        raise ValueError("map: expected a grid and scans, got None")
+
+    @jax.jit
+    def total(params: Params, poses: jax.Array, ranges: jax.Array, counted: jax.Array, angles: jax.Array) -> Foresight:
+        def one(poses: jax.Array, ranges: jax.Array, counted: jax.Array) -> Foresight:
+            return foresee(
+                params.l_occ,
+                params.l_free,
+                poses,
+                ranges,
+                counted,
+                angles,
+                spec=spec,
+                min_range=config.min_range,
+                max_range=config.max_range,
+                bins=True,
+            )
+
+        return jax.tree.map(lambda x: jnp.sum(x, axis=0), jax.vmap(one)(poses, ranges, counted))
+
+    arrays = (jnp.asarray(x) for x in (poses, batch.inputs.ranges, batch.counted, batch.beam_angles))
+    sums = jax.tree.map(lambda x: np.asarray(x, np.float64), total(params, *arrays))
+    some = np.maximum(sums.bin_cells, 1)
+    return {
+        "log_loss": float(sums.log_loss / sums.cells),
+        "cells": float(sums.cells),
+        "calibration_error": float(np.abs(sums.bin_probability - sums.bin_hits).sum() / sums.bin_cells.sum()),
+        "calibration_cells": sums.bin_cells.tolist(),
+        "calibration_probability": (sums.bin_probability / some).tolist(),
+        "calibration_frequency": (sums.bin_hits / some).tolist(),
+    }

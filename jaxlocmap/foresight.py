@@ -1,0 +1,150 @@
+"""How well a map foresees the next scan: what tells a good inverse sensor model from a bad one without a true map.
+
+Before a scan goes into the map, the map says of every cell a beam crosses or ends in how likely it is occupied; the
+beam then says whether it was.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxlocmap import checks, grid
+from jaxlocmap.batching import scan, zero_like_any
+from jaxlocmap.beams import flat_cells, longest_crossing, trace
+from jaxlocmap.types import GridSpec
+
+BINS = 20  # of probability
+
+
+class Foresight(NamedTuple):
+    """Sums over the cells of beams; a cell that several beams cross counts as often."""
+
+    log_loss: jax.Array  # () nats
+    cells: jax.Array  # ()
+    bin_cells: jax.Array  # (BINS,) cells by the probability the map gave them
+    bin_probability: jax.Array  # (BINS,) sum of those probabilities
+    bin_hits: jax.Array  # (BINS,) how many of those cells a beam ended in
+
+
+def scan_log_loss(
+    log_odds: jax.Array,
+    pose: jax.Array,
+    ranges: jax.Array,
+    beam_angles: jax.Array,
+    *,
+    spec: GridSpec,
+    min_range: float,
+    max_range: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Log-loss of a scan under the map before it.
+
+        Σ_beams [ Σ_crossed -log(1 - p) - log p_end ],   p = 1 / (1 + exp(-L))
+
+    Args:
+        log_odds: (rows, columns) nats; values outside the bounds of `spec` count as at them. pose: (3,) m, m, rad.
+        ranges: (B,) m. beam_angles: (B,) rad, body frame. spec, min_range, max_range: as in `beams.beam_cells`.
+
+    Returns:
+        () nats, and the number of cells, (). A cell never seen costs log 2. Source: Good 1952 (the score).
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    ends, crossed = _before(log_odds, pose, ranges, beam_angles, spec, min_range, max_range)
+    loss = jnp.sum(jnp.where(ends.seen, jax.nn.softplus(-ends.log_odds), 0))
+    loss = loss + jnp.sum(jnp.where(crossed.seen, jax.nn.softplus(crossed.log_odds), 0))
+    return loss, (jnp.sum(ends.seen) + jnp.sum(crossed.seen)).astype(loss.dtype)
+
+
+def foresee(
+    l_occ: jax.Array,
+    l_free: jax.Array,
+    poses: jax.Array,
+    ranges: jax.Array,
+    counted: jax.Array,
+    beam_angles: jax.Array,
+    *,
+    spec: GridSpec,
+    min_range: float,
+    max_range: float,
+    bins: bool = False,
+) -> Foresight:
+    """Map scan after scan into an empty map, each judged by the map before it.
+
+    Args:
+        l_occ, l_free: () nats, > 0 and < 0. poses: (T, 3) m, m, rad. ranges: (T, B) m. counted: (T,) bool, the scans
+            that are judged; all are mapped. beam_angles: (B,) rad. spec, min_range, max_range: as in
+            `beams.beam_cells`. bins: fill the bins too, which takes longer; zero otherwise.
+
+    Returns:
+        `Foresight` of this drive. Its derivative by `l_occ` and `l_free` is exact (zero where a cell sits at a bound
+        of `spec`); by the poses it is zero.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shape("poses", poses, (None, 3))
+    checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
+    checks.shape("counted", counted, (len(poses),))
+    dtype = jnp.result_type(l_occ)
+    poses, ranges, beam_angles = (jnp.asarray(x, dtype) for x in (poses, ranges, beam_angles))
+    limits = {"min_range": min_range, "max_range": max_range}
+    zero = zero_like_any(l_occ, l_free, poses, ranges, counted, beam_angles).astype(dtype)
+
+    def body(
+        carry: tuple[jax.Array, Foresight], now: tuple[jax.Array, ...]
+    ) -> tuple[tuple[jax.Array, Foresight], None]:
+        (log_odds, total), (pose, scan, counts) = carry, now
+        loss, cells = scan_log_loss(log_odds, pose, scan, beam_angles, spec=spec, **limits)
+        binned = (total.bin_cells, total.bin_probability, total.bin_hits)
+        if bins:
+            more = _binned(*_before(log_odds, pose, scan, beam_angles, spec, **limits))
+            binned = tuple(a + jnp.where(counts, b, 0) for a, b in zip(binned, more, strict=True))
+        total = Foresight(
+            total.log_loss + jnp.where(counts, loss, 0), total.cells + jnp.where(counts, cells, 0), *binned
+        )
+        return (grid.add_scan(log_odds, pose, scan, beam_angles, l_occ, l_free, spec=spec, **limits), total), None
+
+    none = jnp.full(BINS, zero)
+    start = (jnp.full(spec.shape, zero), Foresight(zero, zero, none, none, none))
+    return scan(body, start, (poses, ranges, counted))[0][1]
+
+
+class _Cells(NamedTuple):
+    log_odds: jax.Array  # within the bounds
+    seen: jax.Array  # bool: there is such a cell, and it lies on the map
+
+
+def _before(
+    log_odds: jax.Array,
+    pose: jax.Array,
+    ranges: jax.Array,
+    beam_angles: jax.Array,
+    spec: GridSpec,
+    min_range: float,
+    max_range: float,
+) -> tuple[_Cells, _Cells]:
+    """What the map says of the cells that beams end in (B,) and cross (B, K)."""
+    checks.shape("log_odds", log_odds, spec.shape)
+    lines = trace(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
+    j = jnp.arange(longest_crossing(spec, max_range), dtype=jnp.int32)[None]
+
+    def said(cells: jax.Array, seen: jax.Array) -> _Cells:
+        there = jnp.where(seen, cells, 0)
+        return _Cells(jnp.clip(log_odds.ravel()[there], spec.l_min, spec.l_max), seen)
+
+    ends = said(flat_cells(lines, lines.last[:, None], spec)[:, 0], lines.last >= 0)
+    return ends, said(flat_cells(lines, j, spec), j < lines.free[:, None])
+
+
+def _binned(ends: _Cells, crossed: _Cells) -> tuple[jax.Array, jax.Array, jax.Array]:
+    values = jnp.concatenate([ends.log_odds, crossed.log_odds.ravel()])
+    seen = jnp.concatenate([ends.seen, crossed.seen.ravel()]).astype(values.dtype)
+    hits = seen * (jnp.arange(len(values)) < len(ends.seen))
+    p = grid.probability(values)
+    rows = jnp.clip((p * BINS).astype(jnp.int32), 0, BINS - 1)
+    sums = [jnp.zeros(BINS, p.dtype).at[rows].add(x) for x in (seen, seen * p, hits)]
+    return sums[0], sums[1], sums[2]

@@ -1,0 +1,23 @@
+"""Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. No matplotlib elsewhere."""
+
+from jaxlocmap.plotting.maps import map_figure, trajectory_figure
+from jaxlocmap.plotting.studies import log_nees_figure, precision_figure, study_figure, sweep_figure
+from jaxlocmap.plotting.tuning import (
+    calibration_figure,
+    descent_figure,
+    log_before_after_figure,
+    study_before_after_figure,
+)
+
+__all__ = [
+    "calibration_figure",
+    "descent_figure",
+    "log_before_after_figure",
+    "log_nees_figure",
+    "map_figure",
+    "precision_figure",
+    "study_before_after_figure",
+    "study_figure",
+    "sweep_figure",
+    "trajectory_figure",
+]

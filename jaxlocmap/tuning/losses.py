@@ -1,0 +1,387 @@
+"""What a filter can be tuned for. Each loss is a pure function of parameters and a batch; an `Objective` is a
+weighted sum of them over one run of the filter.
+
+An observation that the gate refuses moves nothing, but it is judged all the same: it pays in `innovation` what an
+outlier pays and in `nis` for its distance, so that refusing is no way to win; and what is paid grows ever more slowly
+with the distance, so that one false reading does not outweigh a thousand good ones. Both are smooth across the gate,
+so the gradient has no part that a comparison hides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+
+from jaxlocmap import checks, consistency
+from jaxlocmap.foresight import foresee
+from jaxlocmap.linalg import Matrix, ldl
+from jaxlocmap.pipeline import init, run
+from jaxlocmap.tuning.batch import Batch
+from jaxlocmap.tuning.forward import forward
+from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params
+
+OUTLIER_SHARE = 0.01  # of observations, what `innovation` allows for
+LEVER = 1.0  # m: a heading error of 1 rad counts in `state` as a position error of this
+_FAR = 1e-4  # share of good values beyond which `nees` and `nis` count distances by their logarithm
+
+
+class _Step(NamedTuple):
+    """What losses may look at, of one step of one sequence."""
+
+    info: Info
+    truth: jax.Array | None
+    outlier_density: float
+
+
+class _Loss(NamedTuple):
+    needs: str  # "observations", "truth" or "scans"
+    tally: Callable[[_Step], tuple[jax.Array, ...]]  # what a step adds up; the last entry counts
+    value: Callable[[tuple[jax.Array, ...]], jax.Array]  # of the sums over all that is counted
+
+
+def innovation(params: Params, batch: Batch, *, config: Config) -> jax.Array:
+    """Negative log-likelihood of the innovations, the mean over observations. Needs no truth.
+
+        -log[ (1 - e) N(r; 0, S) + e / (2 pi max_range) ],   e = 0.01
+
+    The second term is the density of a false reading, anywhere in reach. It is what a refused observation comes to,
+    and for the good ones it makes no difference. Where errors are correlated in time this loss does not see it: the
+    innovations look right while the pose is over-confident. Then tune with truth.
+
+    Args:
+        params: the filter's. batch: with observations. config: the filter's.
+
+    Returns:
+        () nats; NaN where nothing is observed. Source: Schweppe 1965 (the likelihood of innovations); Box & Tiao 1968
+        (the mixture).
+    """
+    return _alone("innovation", params, batch, config)
+
+
+def pose(params: Params, batch: Batch, *, config: Config) -> jax.Array:
+    """Negative log density of the true pose under the belief, the mean over steps with truth.
+
+        1/2 [ eᵀ P⁻¹ e + log |P| + 3 log 2 pi ]
+
+    It rewards accuracy and honesty at once: at its minimum over a common scale of all covariances the mean NEES is 3.
+
+    Args, returns: as in `innovation`, of a batch with truth. Source: Abbeel et al. 2005, section 3.
+    """
+    return _alone("pose", params, batch, config)
+
+
+def state(params: Params, batch: Batch, *, config: Config) -> jax.Array:
+    """Squared error of the pose, the mean over steps with truth: e_x² + e_y² + (1 m · e_theta)².
+
+    It asks for accuracy alone. The gain of a filter hangs on ratios of its noise, so the scale of the covariance is
+    left where it was.
+
+    Args, returns: as in `innovation`, in m², of a batch with truth. Source: Greenberg, Yannay & Mannor 2023.
+    """
+    return _alone("state", params, batch, config)
+
+
+def nees(params: Params, batch: Batch, *, config: Config) -> jax.Array:
+    """How far the normalised errors of the pose are from what an honest filter shows, in mean and in spread.
+
+        (m - m_chi)² + (s - s_chi)²
+
+    m and s are mean and standard deviation of sqrt(NEES) over steps with truth, and m_chi, s_chi those of χ with 3
+    degrees. A filter that is too modest half of the time and too sure the other half has the right mean and the wrong
+    spread. Beyond the 0.9999 quantile distances grow with their logarithm, so that a lost run does not decide.
+
+    Args, returns: as in `innovation`, dimensionless, of a batch with truth. Source: Gelbrich 1990 (it is a lower bound
+    of the squared Wasserstein distance, met if both distributions have one shape).
+    """
+    return _alone("nees", params, batch, config)
+
+
+def nis(params: Params, batch: Batch, *, config: Config) -> jax.Array:
+    """As `nees`, of the normalised innovations: χ with 2 degrees, over all observations, let in or not. Needs no truth.
+
+    Args, returns: as in `innovation`, dimensionless.
+    """
+    return _alone("nis", params, batch, config)
+
+
+def map(params: Params, batch: Batch, *, config: Config) -> jax.Array:
+    """Log-loss of each scan under the map before it (`foresight.scan_log_loss`), the mean over cells of beams. Needs no
+    truth.
+
+    It hangs on `l_occ` and `l_free`, and on the other parameters through the pose, of which its derivative is zero.
+
+    Args, returns: as in `innovation`, in nats, of a batch with scans; `config` with a grid.
+    """
+    return _alone("map", params, batch, config)
+
+
+def _innovation_tally(step: _Step) -> tuple[jax.Array, ...]:
+    seen = step.info.row >= 0
+    good = step.info.log_likelihood + math.log(1 - OUTLIER_SHARE)
+    false = jnp.asarray(math.log(OUTLIER_SHARE * step.outlier_density), good.dtype)
+    return -jnp.sum(jnp.where(seen, jnp.logaddexp(good, false), 0)), jnp.sum(seen).astype(good.dtype)
+
+
+def _pose_tally(step: _Step) -> tuple[jax.Array, ...]:
+    mean, cov = step.info.belief
+    error = consistency.pose_error(_truth(step), mean)
+    log_det = sum(jnp.log(d) for d in ldl(Matrix.symmetric(cov))[1])
+    return 0.5 * (consistency.nees(error, cov) + log_det + 3 * math.log(2 * math.pi)), jnp.ones((), mean.dtype)
+
+
+def _state_tally(step: _Step) -> tuple[jax.Array, ...]:
+    x, y, yaw = consistency.pose_error(_truth(step), step.info.belief.mean)
+    return x * x + y * y + (LEVER * yaw) ** 2, jnp.ones((), x.dtype)
+
+
+def _nees_tally(step: _Step) -> tuple[jax.Array, ...]:
+    mean, cov = step.info.belief
+    d = _distance(consistency.nees(consistency.pose_error(_truth(step), mean), cov), 3)
+    return d, d * d, jnp.ones((), d.dtype)
+
+
+def _nis_tally(step: _Step) -> tuple[jax.Array, ...]:
+    seen = step.info.row >= 0
+    d = jnp.where(seen, _distance(jnp.where(seen, step.info.nis, 1), 2), 0)
+    return jnp.sum(d), jnp.sum(d * d), jnp.sum(seen).astype(d.dtype)
+
+
+def _truth(step: _Step) -> jax.Array:
+    if step.truth is None:
+        raise ValueError("batch.truth: expected the true poses (N, T, 3), which this loss needs, got None")
+    return step.truth
+
+
+def _distance(squared: jax.Array, degrees: int) -> jax.Array:
+    """The root of a squared Mahalanobis distance, beyond the far quantile growing with its logarithm."""
+    d = jnp.sqrt(jnp.maximum(squared, 1e-12))  # at zero a root has no derivative
+    far = math.sqrt(consistency.chi2_quantile(1 - _FAR, degrees))
+    return jnp.where(d > far, far + jnp.log1p(jnp.maximum(d - far, 0)), d)
+
+
+def _mean(sums: tuple[jax.Array, ...]) -> jax.Array:
+    return sums[0] / sums[1]
+
+
+def _from_chi(sums: tuple[jax.Array, ...], degrees: int) -> jax.Array:
+    mean, square = sums[0] / sums[2], sums[1] / sums[2]
+    spread = jnp.sqrt(jnp.maximum(square - mean * mean, 1e-12))
+    expected = math.sqrt(2) * math.exp(
+        float(scipy.special.gammaln((degrees + 1) / 2) - scipy.special.gammaln(degrees / 2))
+    )
+    return (mean - expected) ** 2 + (spread - math.sqrt(degrees - expected**2)) ** 2
+
+
+LOSSES: Mapping[str, _Loss] = {
+    "innovation": _Loss("observations", _innovation_tally, _mean),
+    "pose": _Loss("truth", _pose_tally, _mean),
+    "state": _Loss("truth", _state_tally, _mean),
+    "nees": _Loss("truth", _nees_tally, functools.partial(_from_chi, degrees=3)),
+    "nis": _Loss("observations", _nis_tally, functools.partial(_from_chi, degrees=2)),
+    "map": _Loss("scans", lambda step: (), _mean),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Objective:
+    """A weighted sum of losses: `objective(params, batch) -> (total (), {loss: ()})`. Hashable, static under jit.
+
+    Raises:
+        ValueError: no loss, an unknown one, a weight that is not positive, or `map` without a grid.
+    """
+
+    config: Config
+    weights: tuple[tuple[str, float], ...]
+
+    def __post_init__(self) -> None:
+        if not self.weights:
+            raise ValueError(f"weights: expected at least one of {sorted(LOSSES)}, got none")
+        for name, weight in self.weights:
+            if name not in LOSSES:
+                raise ValueError(f"loss: expected one of {sorted(LOSSES)}, got {name!r}")
+            if not (math.isfinite(weight) and weight > 0):
+                raise ValueError(f"weight of {name}: expected a positive number, got {weight}")
+        if "map" in self.names and self.config.grid is None:
+            raise ValueError("config.grid: expected the GridSpec of the map, which the loss `map` needs, got None")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The losses, in order."""
+        return tuple(name for name, _ in self.weights)
+
+    def __call__(self, params: Params, batch: Batch, shares: jax.Array | None = None) -> tuple[jax.Array, Any]:
+        """The weighted sum and each loss.
+
+        Args:
+            shares: (N,) how much each sequence counts, 1 by default.
+        """
+        sums = tallies(params, batch, config=self.config, names=self.names)
+        if shares is not None:
+            sums = jax.tree.map(lambda x: x * shares, sums)
+        terms = {name: LOSSES[name].value(tuple(jnp.sum(x) for x in sums[name])) for name in self.names}
+        return sum(weight * terms[name] for name, weight in self.weights), terms
+
+    def check(self, params: Params, batch: Batch) -> None:
+        """Raise if there is nothing to tune on, or if the start cannot be judged.
+
+        Raises:
+            ValueError: a loss whose observations, truth or scans are not there; a filter that refuses everything at
+                `params`; a loss that is not finite there, with the number of sequences at fault.
+        """
+        _check_shapes(batch)
+        observed = np.asarray(batch.inputs.valid) & np.asarray(batch.counted)[..., None]
+        for name in self.names:
+            needs = LOSSES[name].needs
+            if needs == "truth" and (batch.truth is None or batch.known is None):
+                raise ValueError(f"batch.truth: expected the true poses, which the loss `{name}` needs, got None")
+            if needs == "truth" and not np.any(np.asarray(batch.known) & np.asarray(batch.counted)):
+                raise ValueError(f"batch.truth: expected a step with a known pose for the loss `{name}`, got none")
+            if needs == "observations" and not observed.any():
+                raise ValueError(f"batch.inputs.valid: expected an observation for the loss `{name}`, got none")
+            if needs == "scans" and (batch.inputs.ranges is None or batch.beam_angles is None):
+                raise ValueError(f"batch.inputs.ranges: expected scans, which the loss `{name}` needs, got None")
+        sums, accepted = _at_start(params, batch, config=self.config, names=self.names)
+        if accepted is not None and observed.any() and not int(accepted):
+            raise ValueError(
+                f"config.gate_probability: at the start the gate refuses all {int(observed.sum())} observations, so "
+                "nothing corrects the pose: expected a start with wider Q or R, or no gate (None)"
+            )
+        for name, columns in sums.items():
+            bad = ~np.all([np.isfinite(np.asarray(x)) for x in columns], axis=0)
+            if bad.any():
+                raise ValueError(
+                    f"loss `{name}`: expected a finite value at the start, got none for {int(bad.sum())} of {len(bad)} "
+                    f"sequences, the first being number {int(np.argmax(bad))}"
+                )
+
+
+def tallies(
+    params: Params, batch: Batch, *, config: Config, names: tuple[str, ...]
+) -> dict[str, tuple[jax.Array, ...]]:
+    """What every sequence adds to every loss: (N,) each. `LOSSES[name].value` makes a loss of their sums."""
+    density = 1 / (2 * math.pi * config.max_range)
+    of_filter = tuple(name for name in names if name != "map")
+
+    def collect(info: Info, aside: Judged) -> Any:
+        sums = {}
+        for name in of_filter:
+            judged = aside.counted
+            if LOSSES[name].needs == "truth" and aside.known is not None:
+                judged = judged & aside.known
+            sums[name] = tuple(jnp.where(judged, x, 0) for x in LOSSES[name].tally(_Step(info, aside.truth, density)))
+        return sums, info.belief.mean if "map" in names and batch.poses is None else ()
+
+    poses = batch.poses
+    sums: dict[str, Any] = {}
+    if of_filter or poses is None:
+        per_step, means = filtered(params, batch, config=config, collect=collect)
+        sums = {name: tuple(jnp.sum(x, axis=1) for x in columns) for name, columns in per_step.items()}
+        poses = means if poses is None else poses
+    if "map" in names:
+        # Reverse mode would keep a map of every step; the map has two parameters, so two more maps will do.
+        sums["map"] = forward(functools.partial(_foreseen, config=config))(
+            (jnp.asarray(params.l_occ), jnp.asarray(params.l_free)), (batch, jax.lax.stop_gradient(poses))
+        )
+    return sums
+
+
+class Judged(NamedTuple):
+    """What is known of a step beside what the filter reports."""
+
+    counted: jax.Array  # () bool
+    truth: jax.Array | None  # (3,)
+    known: jax.Array | None  # () bool
+
+
+def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[[Info, Judged], Any]) -> Any:
+    """The filter over every sequence, without mapping: what `collect` made of each step, leading axes (N, T).
+
+    Raises:
+        ValueError, TypeError: as `pipeline.run`; fields of the batch that do not fit.
+    """
+    _check_shapes(batch)
+    config = dataclasses.replace(config, grid=None)
+    dtype = jnp.asarray(batch.prior.mean).dtype
+    params, landmarks, truth = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, batch.landmarks, batch.truth))
+
+    def one(prior: Gaussian, inputs: Inputs, judged: Judged) -> Any:
+        state = init(prior, config=config)
+        return run(
+            params,
+            state,
+            inputs,
+            landmarks=landmarks,
+            config=config,
+            collect=lambda state, info, aside: collect(info, aside),
+            aside=judged,
+        )[1]
+
+    judged = Judged(jnp.asarray(batch.counted), truth, batch.known)
+    return jax.vmap(one)(batch.prior, batch.inputs._replace(ranges=None), judged)
+
+
+def beliefs(params: Params, batch: Batch, *, config: Config) -> Gaussian:
+    """The filter's belief after every step, (N, T, 3) and (N, T, 3, 3)."""
+    return filtered(params, batch, config=config, collect=lambda info, _: info.belief)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "names"))
+def _at_start(params: Params, batch: Batch, *, config: Config, names: tuple[str, ...]) -> tuple[Any, Any]:
+    """The tallies, and how many observations the gate lets in, if the filter is asked at all."""
+    sums = tallies(params, batch, config=config, names=names)
+    if batch.poses is not None and names == ("map",):
+        return sums, None
+    let_in = filtered(
+        params, batch, config=config, collect=lambda info, judged: jnp.sum(info.accepted & judged.counted)
+    )
+    return sums, jnp.sum(let_in)
+
+
+def _foreseen(amounts: tuple[jax.Array, jax.Array], data: tuple[Batch, jax.Array], *, config: Config) -> Any:
+    batch, poses = data
+    spec = config.grid
+    if spec is None or batch.inputs.ranges is None or batch.beam_angles is None:
+        raise ValueError("loss `map`: expected config.grid, batch.inputs.ranges and batch.beam_angles, got None")
+
+    def one(poses: jax.Array, ranges: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
+        total = foresee(
+            *amounts,
+            poses,
+            ranges,
+            counted,
+            jnp.asarray(batch.beam_angles),
+            spec=spec,
+            min_range=config.min_range,
+            max_range=config.max_range,
+        )
+        return total.log_loss, total.cells
+
+    return jax.vmap(one)(jnp.asarray(poses), batch.inputs.ranges, batch.counted)
+
+
+def _alone(name: str, params: Params, batch: Batch, config: Config) -> jax.Array:
+    return Objective(config, ((name, 1.0),))(params, batch)[0]
+
+
+def _check_shapes(batch: Batch) -> None:
+    """Raise if the fields of a batch do not fit.
+
+    Raises:
+        ValueError: a wrong shape. TypeError: a field that is no array.
+    """
+    checks.shape("batch.counted", batch.counted, (None, None))
+    n, steps = np.shape(batch.counted)
+    checks.shape("batch.prior.mean", batch.prior.mean, (n, 3))
+    checks.shape("batch.prior.cov", batch.prior.cov, (n, 3, 3))
+    checks.shape("batch.inputs.dt", batch.inputs.dt, (n, steps))
+    for name, shape in (("truth", (n, steps, 3)), ("known", (n, steps)), ("poses", (n, steps, 3))):
+        if getattr(batch, name) is not None:
+            checks.shape(f"batch.{name}", getattr(batch, name), shape)
