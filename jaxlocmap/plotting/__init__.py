@@ -1,4 +1,4 @@
-"""Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. No matplotlib elsewhere."""
+"""Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. Nowhere else: matplotlib."""
 
 from jaxlocmap.plotting.maps import map_figure, trajectory_figure
 from jaxlocmap.plotting.studies import log_nees_figure, precision_figure, study_figure, sweep_figure

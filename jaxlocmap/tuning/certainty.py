@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap.tuning.batch import Batch
-from jaxlocmap.tuning.fit import coordinates_objective
 from jaxlocmap.tuning.losses import Objective
-from jaxlocmap.tuning.parameters import constrain, natural, unconstrain
+from jaxlocmap.tuning.parameters import NAMES, constrain, natural, unconstrain
 from jaxlocmap.types import Params
 
 _VAGUE = 1.0  # a standard error of the logarithm above this: not even the order of magnitude
@@ -34,8 +33,8 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
 
         cov = H⁻¹ (Σ_n g_n g_nᵀ) H⁻¹ N / (N - 1)
 
-    H is the Hessian of the objective by the coordinates, g_n the derivative of its gradient by the share of sequence
-    n: the infinitesimal jackknife, which for a mean is the usual sandwich. It needs nothing but sequences that are
+    H is the Hessian of the objective by the coordinates, g_n the derivative of its gradient by how much sequence n
+    counts: the infinitesimal jackknife, which for a mean is the usual sandwich. It needs nothing but sequences that are
     independent of each other, so it holds for every loss and where the filter's model does not; for errors that are
     correlated in time make the windows longer than the correlation.
 
@@ -50,25 +49,39 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
     n = len(batch.counted)
     if n < 2:
         raise ValueError(f"batch: expected at least two sequences to compare, got {n}; cut long ones into windows")
-    at = coordinates_objective(objective, params, tuned)
+    if not tuned or any(name not in NAMES for name in tuned):
+        raise ValueError(f"tuned: expected some of {NAMES}, got {tuned}")
     whole = unconstrain(params)
     theta = jnp.stack([whole[name] for name in tuned]).astype(jnp.asarray(batch.prior.mean).dtype)
 
-    def named(theta: jax.Array) -> dict[str, jax.Array]:
-        return dict(zip(tuned, theta, strict=True))
-
-    def total(theta: jax.Array, shares: jax.Array, batch: Batch) -> jax.Array:
-        return at(named(theta), (batch, shares))[0]
+    def at(theta: jax.Array) -> Params:
+        return constrain(whole | dict(zip(tuned, theta, strict=True)))
 
     @jax.jit
-    def derivatives(theta: jax.Array, shares: jax.Array, batch: Batch) -> tuple[jax.Array, ...]:
-        hessian = jax.jacfwd(jax.grad(total))(theta, shares, batch)
-        influence = jax.jacfwd(jax.grad(total, argnums=1))(theta, shares, batch)
-        scale = jax.jacfwd(lambda x: jnp.stack([natural(constrain(whole | named(x)))[name] for name in tuned]))(theta)
+    def derivatives(theta: jax.Array, batch: Batch) -> tuple[jax.Array, ...]:
+        def tallied(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+            each = jnp.stack(jax.tree.leaves(objective.tallies(at(theta), batch)), axis=-1)
+            return each, each
+
+        def first(theta: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+            slope, each = jax.jacfwd(tallied, has_aux=True)(theta)
+            return jnp.sum(slope, axis=0), (slope, each)
+
+        def total(sums: jax.Array) -> jax.Array:
+            form = jax.tree.structure(jax.eval_shape(objective.tallies, params, batch))
+            return objective.value(jax.tree.unflatten(form, list(sums)))[0]
+
+        # n: sequences, k, l: what they add up, i, j: coordinates
+        second_of_sum, (slope, each) = jax.jacfwd(first, has_aux=True)(theta)
+        sums, slope_of_sum = jnp.sum(each, axis=0), jnp.sum(slope, axis=0)
+        weight, bend = jax.grad(total)(sums), jax.hessian(total)(sums)
+        hessian = jnp.einsum("k,kij->ij", weight, second_of_sum)
+        hessian = hessian + jnp.einsum("kl,ki,lj->ij", bend, slope_of_sum, slope_of_sum)
+        influence = jnp.einsum("k,nki->ni", weight, slope) + jnp.einsum("kl,nl,ki->ni", bend, each, slope_of_sum)
+        scale = jax.jacfwd(lambda x: jnp.stack([natural(at(x))[name] for name in tuned]))(theta)
         return hessian, influence, scale
 
-    parts = derivatives(theta, jnp.ones(n, theta.dtype), batch)
-    hessian, influence, scale = (np.asarray(x, np.float64) for x in parts)
+    hessian, influence, scale = (np.asarray(x, np.float64) for x in derivatives(theta, batch))
     estimate = np.array([float(natural(params)[name]) for name in tuned])
     return _judge(tuned, estimate, 0.5 * (hessian + hessian.T), influence, scale)
 

@@ -44,14 +44,14 @@ class Fit(NamedTuple):
 
 
 def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str, ...]) -> Callable[..., Any]:
-    """The objective as a function of the tuned coordinates: `f(coordinates, (batch, shares)) -> (total, terms)`, the
+    """The objective as a function of the tuned coordinates: `f(coordinates, batch) -> (total, {loss: ()})`, the
     other parameters held at `params`. Its derivative is taken forward, also under `jax.grad`.
 
     It is what any other optimiser needs. SciPy's, say:
 
         f = coordinates_objective(objective, params, NOISE)
         start, unravel = ravel_pytree({name: unconstrain(params)[name] for name in NOISE})
-        slope = jax.jit(jax.value_and_grad(lambda x: f(unravel(x), (batch, None))[0]))
+        slope = jax.jit(jax.value_and_grad(lambda x: f(unravel(x), batch)[0]))
         found = scipy.optimize.minimize(lambda x: jax.tree.map(np.asarray, slope(x)), start, jac=True, method="BFGS")
         tuned = constrain(unconstrain(params) | unravel(found.x))
 
@@ -63,8 +63,8 @@ def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str
     params.check()
     fixed = {name: value for name, value in unconstrain(params).items() if name not in tuned}
 
-    def at(coordinates: Coordinates, data: tuple[Batch, Any]) -> Any:
-        return objective(constrain(fixed | coordinates), *data)
+    def at(coordinates: Coordinates, batch: Batch) -> Any:
+        return objective(constrain(fixed | coordinates), batch)
 
     return forward(at)
 
@@ -125,7 +125,7 @@ def fit(
             batch = pick(batch, jax.random.choice(key, runs, (minibatch,), replace=False))
 
         def value(theta: Coordinates) -> jax.Array:
-            return at(theta, (batch, None))[0]
+            return at(theta, batch)[0]
 
         known, fresh = optax.tree.get(state, "value", None), jnp.ones((), bool)
         if minibatch is None and optax.tree.get(state, "grad", None) is not None:  # of a line search, at its end
@@ -147,7 +147,7 @@ def fit(
 
     @jax.jit
     def judged(theta: Coordinates, judge: Batch) -> jax.Array:
-        return at(theta, (judge, None))[0]
+        return at(theta, judge)[0]
 
     keys = jax.random.split(key, (epochs, steps)) if key is not None else np.zeros((epochs, steps))
     carry = _strong((theta, optimiser.init(theta)))

@@ -217,17 +217,18 @@ class Objective:
         """The losses, in order."""
         return tuple(name for name, _ in self.weights)
 
-    def __call__(self, params: Params, batch: Batch, shares: jax.Array | None = None) -> tuple[jax.Array, Any]:
-        """The weighted sum and each loss.
+    def __call__(self, params: Params, batch: Batch) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """The weighted sum, and each loss."""
+        return self.value(jax.tree.map(jnp.sum, self.tallies(params, batch)))
 
-        Args:
-            shares: (N,) how much each sequence counts, 1 by default.
-        """
-        sums = tallies(params, batch, config=self.config, names=self.names)
-        if shares is not None:
-            sums = jax.tree.map(lambda x: x * shares, sums)
-        terms = {name: LOSSES[name].value(tuple(jnp.sum(x) for x in sums[name])) for name in self.names}
-        return sum(weight * terms[name] for name, weight in self.weights), terms
+    def tallies(self, params: Params, batch: Batch) -> dict[str, tuple[jax.Array, ...]]:
+        """What every sequence adds to every loss, (N,) each."""
+        return tallies(params, batch, config=self.config, names=self.names)
+
+    def value(self, sums: dict[str, tuple[jax.Array, ...]]) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """What a call returns, of the tallies' sums over sequences."""
+        terms = {name: LOSSES[name].value(sums[name]) for name in self.names}
+        return jnp.asarray(sum(weight * terms[name] for name, weight in self.weights)), terms
 
     def check(self, params: Params, batch: Batch) -> None:
         """Raise if there is nothing to tune on, or if the start cannot be judged.
