@@ -52,7 +52,7 @@ class TuneConfig:
     judge_runs: int = 2000
     """Fresh runs to judge by."""
     gate: float | None = 0.9999
-    """The gate while tuning. It should refuse what is surely false: no derivative sees its decision, and one that also
+    """The gate while tuning, which weighs readings instead of deciding. It is for what is surely false: one that also
     refuses a good reading in a hundred pulls the result by some per cent."""
     judge_gate: float | None = 0.99
     """The gate the result is judged with."""

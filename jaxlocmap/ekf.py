@@ -17,6 +17,8 @@ from jaxlocmap import checks
 from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve, stack, values
 from jaxlocmap.motion import MotionModel, wrap
 
+_LEAST_WEIGHT = 1e-6  # of an observation at a soft gate: an R of a million times its size says nothing any more
+
 
 class Update(NamedTuple):
     """What a correction made of one observation of dimension m."""
@@ -99,6 +101,7 @@ def update(
     R: jax.Array,
     *,
     threshold: float | jax.Array = float("inf"),
+    softness: float = 0.0,
     valid: jax.Array | bool = True,
 ) -> Update:
     """Correct the belief by one observation of any sensor, in Joseph form, if it passes the gate.
@@ -111,11 +114,15 @@ def update(
         residual: (m,) observation minus its expectation at `mean`, angles wrapped.
         H: (m, 3) Jacobian of the expectation. R: (m, m) covariance of the observation.
         threshold: gate on d², from `gate_threshold(probability, m)`; no gate by default.
+        softness: 0 for a gate that decides. Otherwise, in units of d², one that weighs: every observation corrects the
+            belief, with R / w in the place of R, w = 1 / (1 + exp((d² - threshold) / softness)). Near the threshold
+            the correction then changes smoothly, so that derivatives tell what the gate does.
         valid: () bool; False leaves the belief as it is.
 
     Returns:
         An `Update`; innovation, S, nis and log-likelihood are there whether or not the gate let it in.
-        Source: Bucy & Joseph 1968, section 16; Bar-Shalom, Li & Kirubarajan 2001, section 5.4 (the gate).
+        Source: Bucy & Joseph 1968, section 16; Bar-Shalom, Li & Kirubarajan 2001, section 5.4 (the gate); Chang 2014
+        (R that grows with d²).
 
     Raises:
         ValueError: a wrong shape.
@@ -126,22 +133,27 @@ def update(
         checks.shape(name, value, shape)
     r = tuple(residual[i] for i in range(m))
     P = Matrix.symmetric(cov)
-    corrected = _correct(P, Matrix.of(H), Matrix.symmetric(R), r)
-    shift, nis = corrected.shift, corrected.nis
-    accepted = jnp.logical_and(nis < threshold, valid)  # what is no number is not below, with or without a gate
+    H, noise = Matrix.of(H), Matrix.symmetric(R)
+    reported = corrected = _correct(P, H, noise, r)
+    nis = reported.nis
+    accepted = applied = jnp.logical_and(nis < threshold, valid)  # what is no number is not below, gate or none
+    if softness:
+        weight = jnp.maximum(jax.nn.sigmoid((threshold - nis) / softness), _LEAST_WEIGHT)
+        corrected, applied = _correct(P, H, noise.scale(1 / weight), r), jnp.logical_and(jnp.isfinite(nis), valid)
+    shift = corrected.shift
     moved = mean[0] + shift[0], mean[1] + shift[1], wrap(mean[2] + shift[2])
 
     def chosen(new: Any, old: Any) -> list[jax.Array]:
-        return [jnp.where(accepted, x, y) for x, y in zip(new, old, strict=True)]
+        return [jnp.where(applied, x, y) for x, y in zip(new, old, strict=True)]
 
     return Update(
         mean=stack(chosen(moved, mean)),
         cov=stack([chosen(new, old) for new, old in zip(corrected.cov, P.rows, strict=True)]),
         innovation=residual,
-        S=Matrix(corrected.S).array(cov.dtype),
+        S=Matrix(reported.S).array(cov.dtype),
         nis=nis,
         accepted=accepted,
-        log_likelihood=corrected.log_likelihood,
+        log_likelihood=reported.log_likelihood,
     )
 
 

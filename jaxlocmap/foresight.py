@@ -16,7 +16,7 @@ from jaxlocmap.batching import scan, zero_like_any
 from jaxlocmap.beams import flat_cells, longest_crossing, trace
 from jaxlocmap.types import GridSpec
 
-BINS = 20  # of probability
+BINS = 10  # of probability
 
 
 class Foresight(NamedTuple):
@@ -143,7 +143,7 @@ def _before(
 def _binned(ends: _Cells, crossed: _Cells) -> tuple[jax.Array, jax.Array, jax.Array]:
     values = jnp.concatenate([ends.log_odds, crossed.log_odds.ravel()])
     seen = jnp.concatenate([ends.seen, crossed.seen.ravel()]).astype(values.dtype)
-    hits = seen * (jnp.arange(len(values)) < len(ends.seen))
+    hits = jnp.where(jnp.arange(len(values)) < len(ends.seen), seen, 0)
     p = grid.probability(values)
     rows = jnp.clip((p * BINS).astype(jnp.int32), 0, BINS - 1)
     sums = [jnp.zeros(BINS, p.dtype).at[rows].add(x) for x in (seen, seen * p, hits)]

@@ -62,7 +62,8 @@ def correct(
     residual, H, defined = sensor.linearise(belief.mean, landmark, z, config.sensor_offset)
     used = usable & defined
     threshold = ekf.gate_threshold(config.gate_probability, 2)
-    update = ekf.update(*belief, residual, H, params.R, threshold=threshold, valid=used)
+    softness = config.gate_softness
+    update = ekf.update(*belief, residual, H, params.R, threshold=threshold, softness=softness, valid=used)
 
     def known(x: jax.Array) -> jax.Array:
         return jnp.where(used, x, jnp.zeros_like(x))

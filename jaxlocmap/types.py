@@ -152,6 +152,7 @@ class Config:
     dt: float = 0.1  # s, > 0: the period that Q refers to
     motion: Any = "arc"  # "euler" | "arc" | "capstone" | motion.MotionModel
     gate_probability: Any = 0.99  # in (0, 1): share of good observations let in; None: no gate
+    gate_softness: float = 0.0  # >= 0, of the squared distance: 0 decides, more weighs (`ekf.update`), for derivatives
     sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad: sensor in the body frame
     grid: GridSpec | None = None  # None: localisation alone
     min_range: float = 0.05  # m: a range at or below is no measurement
@@ -159,7 +160,7 @@ class Config:
 
     def __post_init__(self) -> None:
         _freeze_tuples(self, "sensor_offset")
-        for name in ("dt", "min_range", "max_range"):
+        for name in ("dt", "gate_softness", "min_range", "max_range"):
             checks.number(name, getattr(self, name))
         gate = None if isinstance(self.gate_probability, jax.Array) else self.gate_probability
         if gate is not None:
@@ -171,6 +172,8 @@ class Config:
                 f"gate_probability: expected a probability inside (0, 1), or None for no gate, "
                 f"got {self.gate_probability}"
             )
+        if not 0 <= self.gate_softness < math.inf:
+            raise ValueError(f"gate_softness: expected a finite width >= 0, got {self.gate_softness}")
         if len(self.sensor_offset) != 3 or not all(math.isfinite(c) for c in self.sensor_offset):
             raise ValueError(f"sensor_offset: expected finite (dx, dy, dtheta), got {self.sensor_offset}")
         if not 0 <= self.min_range < self.max_range < math.inf:

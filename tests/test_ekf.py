@@ -309,3 +309,50 @@ def test_positive_semi_definite_after_100_000_float32_steps():
     assert np.linalg.eigvalsh(cov).min() > 0
     error = np.asarray(belief.mean, np.float64) - truth
     assert np.abs(error[:, :2]).max() < 0.05  # and it is a filter still: 5 standard deviations of the sensor's range
+
+
+# --- derivatives
+
+
+def plain_update(mean, cov, residual, H, R):
+    """The same formulas in matrices, for the compiler to differentiate: gain and all."""
+    S = H @ cov @ H.T + R
+    K = cov @ H.T @ jnp.linalg.inv(S)
+    A = jnp.eye(3, dtype=cov.dtype) - K @ H
+    nis = residual @ jnp.linalg.inv(S) @ residual
+    log_likelihood = -0.5 * (nis + jnp.log(jnp.linalg.det(S)) + len(residual) * math.log(2 * math.pi))
+    return mean + K @ residual, A @ cov @ A.T + K @ R @ K.T, S, nis, log_likelihood
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("dimension", [1, 2])
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_by_hand_are_those_of_the_formulas(order, dimension, mode, x64):
+    rng = np.random.default_rng(dimension)
+    spread = rng.normal(size=(dimension, dimension))
+    args = (
+        jnp.array([0.4, -0.3, 0.5]),
+        jnp.asarray(COV),
+        jnp.asarray(0.2 * rng.normal(size=dimension)),
+        jnp.asarray(rng.normal(size=(dimension, 3))),
+        jnp.asarray(0.05 * spread @ spread.T + 0.02 * np.eye(dimension)),
+    )
+    directions = [rng.normal(size=np.shape(x)) for x in args]
+    directions = [x + x.T if x.ndim == 2 and x.shape[0] == x.shape[1] else x for x in directions]
+
+    def along(function):
+        """As a function of one number: how far all arguments are moved."""
+
+        def f(t):
+            moved = [x + t * d for x, d in zip(args, directions, strict=True)]
+            return jnp.concatenate([jnp.ravel(x) for x in function(*moved)])
+
+        for _ in range(order):
+            f = mode(f)
+        return f(0.0)
+
+    def by_hand(*args):
+        update = ekf.update(*args)
+        return update.mean, update.cov, update.S, update.nis, update.log_likelihood
+
+    near(along(by_hand), along(plain_update), 1e-10)

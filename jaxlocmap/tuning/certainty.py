@@ -125,8 +125,8 @@ def _tied(names: tuple[str, ...], axis: np.ndarray) -> str:
     down = [name for name, part in zip(names, axis, strict=True) if part < -0.1]
     if len(up) + len(down) == 1:
         return f"{up[0]}: the loss does not depend on it here"
-    against = f" while {', '.join(down)} fall" if down else ""
-    return f"{', '.join(up)} can grow together{against}: the loss does not change"
+    against = f" against {', '.join(down)}" if down else ""
+    return f"{', '.join(up)} can change together{against}: the loss stays the same"
 
 
 def as_report(certainty: Certainty) -> dict[str, Any]:

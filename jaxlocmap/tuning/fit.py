@@ -134,7 +134,8 @@ def fit(
         else:
             loss, gradient = jax.value_and_grad(value)(theta)
         norm = optax.tree.norm(gradient)
-        updates, after = optimiser.update(gradient, state, theta, value=loss, grad=gradient, value_fn=value)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of different widths
+            updates, after = optimiser.update(gradient, state, theta, value=loss, grad=gradient, value_fn=value)
         moved = optax.apply_updates(theta, updates)
         fine = jnp.isfinite(loss) & jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(moved))
         kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), (moved, after), (theta, state))

@@ -1,0 +1,28 @@
+"""Short simulated drives to tune on."""
+
+import dataclasses
+import functools
+
+import jax
+
+from jaxlocmap import GridSpec, simulate, tuning
+
+# In sight of all four landmarks, which the detector looks for in every second step.
+SHORT = dataclasses.replace(
+    simulate.CAPSTONE,
+    name="short",
+    start=(6.0, 8.5, 0.5),
+    steps=12,
+    beams=9,
+    sight_period=2,
+    grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20)),
+)
+OWN = simulate.own_params(simulate.Noise(), SHORT.dt)
+CONFIG = SHORT.config(motion="euler", gate_probability=0.9999)
+ONLY_POSES = SHORT.config(motion="euler", gate_probability=0.9999, grid=False)
+
+
+@functools.cache
+def drives(runs=4, seed=0, scans=True):
+    """A batch of simulated drives."""
+    return tuning.simulated(jax.random.key(seed), runs, simulate.room(), simulate.Noise(), scenario=SHORT, scans=scans)

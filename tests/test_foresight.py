@@ -1,0 +1,91 @@
+"""One scan ahead: the log-loss against plain loops, its derivatives against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+
+from jaxlocmap import GridSpec
+from jaxlocmap.foresight import BINS, foresee, scan_log_loss
+
+SPEC = GridSpec(origin=(-1.0, -2.0), resolution=0.25, shape=(24, 20), l_min=-3.0, l_max=2.5)
+ANGLES = np.linspace(-1.5, 1.5, 7)
+LIMITS = {"min_range": 0.05, "max_range": 3.0}
+L_OCC, L_FREE = 0.9, -0.6
+
+
+def drive(steps=9):
+    rng = np.random.default_rng(3)
+    poses = np.column_stack([rng.uniform(-0.5, 3.5, steps), rng.uniform(-1.5, 3.5, steps), rng.uniform(-3, 3, steps)])
+    poses[4] = (9.0, 9.0, 0.0)  # off the map
+    ranges = rng.uniform(0.3, 3.4, (steps, len(ANGLES)))
+    ranges[2, 3], ranges[5, 1] = np.nan, 0.01
+    return poses, ranges
+
+
+def in_plain_loops(l_occ, l_free, counted):
+    """Log-loss and number of cells. How often beams cross and end in each cell comes from maps of ones."""
+    sizes = {"origin": SPEC.origin, "resolution": SPEC.resolution, **LIMITS}
+    free_range = {"l_min": -1e9, "l_max": 1e9}
+    none = np.zeros(SPEC.shape)
+    log_odds, loss, cells = none.copy(), 0.0, 0.0
+    for pose, ranges, counts in zip(*drive(), counted, strict=True):
+        crossed = reference.update_scan(none, pose, ranges, ANGLES, l_occ=0.0, l_free=1.0, **sizes, **free_range)
+        ended = reference.update_scan(none, pose, ranges, ANGLES, l_occ=1.0, l_free=0.0, **sizes, **free_range)
+        p = reference.probability(log_odds)
+        if counts:
+            loss -= float(np.sum(crossed * np.log(1 - p)) + np.sum(ended * np.log(p)))
+            cells += float(crossed.sum() + ended.sum())
+        bounds = {"l_min": SPEC.l_min, "l_max": SPEC.l_max}
+        log_odds = reference.update_scan(log_odds, pose, ranges, ANGLES, l_occ=l_occ, l_free=l_free, **sizes, **bounds)
+    return loss, cells
+
+
+def foreseen(l_occ, l_free, counted, **kwargs):
+    poses, ranges = (jnp.asarray(x, jnp.result_type(float)) for x in drive())
+    angles = jnp.asarray(ANGLES, poses.dtype)
+    amounts = (jnp.asarray(x, poses.dtype) for x in (l_occ, l_free))
+    return foresee(*amounts, poses, ranges, jnp.asarray(counted), angles, spec=SPEC, **LIMITS, **kwargs)
+
+
+@pytest.mark.parametrize("counted", [np.ones(9, bool), np.arange(9) >= 5])
+def test_it_is_what_plain_loops_give(counted, tolerance):
+    got = foreseen(L_OCC, L_FREE, counted)
+    loss, cells = in_plain_loops(L_OCC, L_FREE, counted)
+    assert float(got.cells) == cells > 50
+    assert float(got.log_loss) == pytest.approx(loss, rel=tolerance(1e-12, 1e-5))
+
+
+def test_a_map_that_knows_nothing_pays_log_two_a_cell(tolerance):
+    poses, ranges = drive()
+    args = (jnp.zeros(SPEC.shape), *map(jnp.asarray, (poses[0], ranges[0], ANGLES)))
+    loss, cells = scan_log_loss(*args, spec=SPEC, **LIMITS)
+    assert float(loss) == pytest.approx(float(cells) * np.log(2), rel=tolerance(1e-13, 1e-6))
+
+
+def test_bins_hold_every_cell_once(tolerance):
+    plain, got = (foreseen(L_OCC, L_FREE, np.ones(9, bool), bins=bins) for bins in (False, True))
+    assert float(got.log_loss) == float(plain.log_loss)
+    assert float(got.bin_cells.sum()) == float(got.cells)
+    assert 0 < float(got.bin_hits.sum()) < float(got.cells)
+    some = np.asarray(got.bin_cells) > 0
+    means = np.asarray(got.bin_probability)[some] / np.asarray(got.bin_cells)[some]
+    edges = np.flatnonzero(some) / BINS
+    assert np.all((means >= edges - 1e-6) & (means <= edges + 1 / BINS + 1e-6))
+
+
+def test_derivatives_are_those_of_the_loops(x64):
+    counted, h = np.ones(9, bool), 1e-6
+    slope = jax.grad(lambda x: foreseen(x[0], x[1], counted).log_loss)(jnp.array([L_OCC, L_FREE]))
+    up, down = in_plain_loops(L_OCC + h, L_FREE, counted)[0], in_plain_loops(L_OCC - h, L_FREE, counted)[0]
+    assert float(slope[0]) == pytest.approx((up - down) / (2 * h), rel=1e-6)
+    up, down = in_plain_loops(L_OCC, L_FREE + h, counted)[0], in_plain_loops(L_OCC, L_FREE - h, counted)[0]
+    assert float(slope[1]) == pytest.approx((up - down) / (2 * h), rel=1e-6)
+
+
+def test_shapes_that_do_not_fit_are_named():
+    amounts, angles = (jnp.array(0.9), jnp.array(-0.6)), jnp.asarray(ANGLES)
+    poses, ranges = (jnp.asarray(x) for x in drive())
+    with pytest.raises(ValueError, match=r"ranges: expected shape \(9, 7\), got \(8, 7\)"):
+        foresee(*amounts, poses, ranges[:8], jnp.ones(9, bool), angles, spec=SPEC, **LIMITS)

@@ -1,0 +1,78 @@
+"""Standard errors against differences, and the words for what the data cannot tell."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from drives import CONFIG, ONLY_POSES, OWN, drives
+
+from jaxlocmap import tuning
+from jaxlocmap.tuning.certainty import _judge
+
+NAMES = ("w", "range")
+
+
+@pytest.mark.parametrize("losses", [(("innovation", 1.0),), (("nis", 1.0), ("state", 5.0))])
+def test_it_is_the_sandwich_of_differences(losses, x64):
+    objective, batch, h = tuning.Objective(ONLY_POSES, losses), drives(scans=False), 1e-4
+    whole = tuning.unconstrain(OWN)
+    sums = jax.jit(lambda x: objective.tallies(tuning.constrain(whole | dict(zip(NAMES, x, strict=True))), batch))
+
+    def gradient(at, share):
+        """By differences, sequence n counting 1 + share[n] times."""
+        slopes = []
+        for i in range(2):
+            values = []
+            for sign in (1, -1):
+                tallied = sums(jnp.asarray(at + sign * h * np.eye(2)[i]))
+                values.append(float(objective.value(jax.tree.map(lambda s: jnp.sum(s * (1 + share)), tallied))[0]))
+            slopes.append((values[0] - values[1]) / (2 * h))
+        return np.array(slopes)
+
+    at, none = np.array([float(whole[name]) for name in NAMES]), np.zeros(4)
+    hessian = np.stack([(gradient(at + d, none) - gradient(at - d, none)) / 2e-3 for d in 1e-3 * np.eye(2)])
+    influence = np.stack([(gradient(at, e) - gradient(at, -e)) / 2e-3 for e in 1e-3 * np.eye(4)])
+    sure = tuning.certainty(objective, OWN, batch, NAMES)
+    np.testing.assert_allclose(sure.hessian, hessian, rtol=1e-3, atol=1e-4 * np.abs(hessian).max())
+    inverse = np.linalg.inv(hessian)
+    cov = inverse @ influence.T @ influence @ inverse * 4 / 3
+    np.testing.assert_allclose(sure.standard_error, np.sqrt(np.diag(cov)) * sure.estimate, rtol=5e-3)
+    assert sure.correlation[0, 1] == pytest.approx(cov[0, 1] / np.sqrt(cov[0, 0] * cov[1, 1]), abs=5e-3)
+
+
+def test_squared_error_leaves_the_scale_open(x64):
+    objective = tuning.Objective(ONLY_POSES, (("state", 1.0),))
+    wide = drives(scans=False)._replace(prior=drives().prior._replace(cov=1e9 * drives().prior.cov))
+    sure = tuning.certainty(objective, OWN, wide, tuning.NOISE)
+    assert "v, w, range, bearing can change together" in " ".join(sure.words)
+    assert np.isinf(sure.standard_error).all()
+
+
+def test_what_a_loss_does_not_see_is_said(x64):
+    sure = tuning.certainty(tuning.Objective(ONLY_POSES, (("innovation", 1.0),)), OWN, drives(), ("range", "l_occ"))
+    assert sure.words == ("l_occ: the loss does not depend on it here",)
+    assert np.isfinite(sure.standard_error[0])
+    assert np.isinf(sure.standard_error[1])
+
+
+def test_a_sensor_model_has_standard_errors_too(x64):
+    sure = tuning.certainty(tuning.Objective(CONFIG, (("map", 1.0),)), OWN, drives(), tuning.SENSOR_MODEL)
+    assert np.all(sure.standard_error > 0)
+
+
+def test_vague_and_tied_parameters_are_named():
+    influence = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    vague = _judge(("v", "w"), np.ones(2), np.diag([1.0, 100.0]), influence, np.eye(2))
+    assert vague.words[0].startswith("v: the data does not tell its order of magnitude")
+    assert len(vague.words) == 1
+    tied = _judge(("v", "w"), np.ones(2), 1e3 * np.array([[1.0, 0.97], [0.97, 1.0]]), influence, np.eye(2))
+    assert tied.words[0].startswith("w and v: known in combination")
+
+
+def test_one_sequence_has_nothing_to_compare_with():
+    one = tuning.pick(drives(), slice(0, 1))
+    objective = tuning.Objective(ONLY_POSES, (("innovation", 1.0),))
+    with pytest.raises(ValueError, match="at least two sequences to compare, got 1"):
+        tuning.certainty(objective, OWN, one, NAMES)
+    with pytest.raises(ValueError, match="tuned: expected some of"):
+        tuning.certainty(objective, OWN, drives(), ())

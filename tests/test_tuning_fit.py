@@ -1,0 +1,120 @@
+"""The descent: what it finds, keeps and counts, and what it refuses."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+import scipy.optimize
+from drives import ONLY_POSES, OWN, SHORT, drives
+from jax.flatten_util import ravel_pytree
+
+from jaxlocmap import simulate, tuning
+
+OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation", 1.0),))
+START = simulate.course_params()
+
+
+def test_it_finds_the_robots_own_noise(x64):
+    """Of 400 drives with one reading in twenty false: to four of the standard errors it claims, and to 2 % for what the
+    gate's decision hides from the gradient.
+    """
+    lying = dataclasses.replace(SHORT, name="lying", steps=40, outliers=True)
+    noise = simulate.Noise(outlier_rate=0.05)
+    batch = tuning.simulated(jax.random.key(4), 400, simulate.room(), noise, scenario=lying)
+    fit = tuning.fit(OBJECTIVE, START, batch)
+    sure = tuning.certainty(OBJECTIVE, fit.params, batch, tuning.NOISE)
+    truth = np.array([float(tuning.natural(OWN)[name]) for name in tuning.NOISE])
+    assert np.all(np.abs(sure.estimate - truth) < 4 * sure.standard_error + 0.02 * truth)
+    assert np.all(sure.standard_error < 0.2 * truth)
+    assert sure.words == ()
+    assert fit.stopped_early
+    assert fit.losses[fit.best_epoch] == fit.loss == min(fit.losses)
+    assert not fit.trace.skipped.any()
+    assert np.all(fit.trace.evaluations >= 1)
+
+
+def test_what_is_frozen_stays_and_what_is_kept_is_the_best():
+    seen = []
+    fit = tuning.fit(
+        OBJECTIVE,
+        START,
+        drives(scans=False),
+        tuned=("range",),
+        optimiser=optax.sgd(5.0),  # far too long steps
+        epochs=4,
+        steps=1,
+        patience=9,
+        progress=seen.append,
+    )
+    for name in ("v", "w", "bearing", "l_occ", "l_free"):
+        np.testing.assert_allclose(tuning.natural(fit.params)[name], tuning.natural(START)[name], rtol=1e-6)
+    assert fit.loss == min(fit.losses)
+    kept = float(OBJECTIVE(fit.params, drives(scans=False))[0])
+    assert kept == pytest.approx(fit.loss, rel=1e-5)
+    # After every epoch the fit so far is there to be kept.
+    assert [len(so_far.losses) for so_far in seen] == [2, 3, 4, 5]
+    assert [len(so_far.trace.loss) for so_far in seen] == [1, 2, 3, 4]
+    assert not fit.stopped_early
+    fit.params.check()
+
+
+def test_a_step_that_is_not_finite_is_skipped_and_counted():
+    """Of two drives one sees nothing, so that half of the minibatches of one have no loss."""
+    batch = tuning.pick(drives(scans=False), slice(0, 2))
+    valid = np.array(batch.inputs.valid)
+    valid[1] = False
+    batch = batch._replace(inputs=batch.inputs._replace(valid=jnp.asarray(valid)))
+    fit = tuning.fit(OBJECTIVE, START, batch, minibatch=1, key=jax.random.key(0), epochs=2, steps=8, patience=9)
+    assert 0 < fit.trace.skipped.sum() < 16
+    np.testing.assert_array_equal(np.isfinite(fit.trace.loss), ~fit.trace.skipped)
+    assert np.isfinite(fit.losses).all()
+    assert fit.loss < fit.losses[0]
+    moved = np.abs(np.diff(fit.trace.params["range"])) > 0
+    np.testing.assert_array_equal(moved, ~fit.trace.skipped[:-1])
+
+
+def test_it_stops_when_the_validation_loss_does_not_fall():
+    fit = tuning.fit(
+        OBJECTIVE,
+        OWN,
+        drives(scans=False),
+        validation=drives(seed=5, scans=False),
+        optimiser=optax.sgd(1e-9),
+        epochs=9,
+        steps=1,
+        patience=3,
+    )
+    assert len(fit.losses) == 1 + 3
+    assert fit.stopped_early
+
+
+def test_scipy_takes_the_same_gradient(x64):
+    f = tuning.coordinates_objective(OBJECTIVE, START, ("range", "bearing"))
+    start, unravel = ravel_pytree({name: tuning.unconstrain(START)[name] for name in ("range", "bearing")})
+    batch = drives(scans=False)
+    slope = jax.jit(jax.value_and_grad(lambda x: f(unravel(x), batch)[0]))
+    found = scipy.optimize.minimize(lambda x: jax.tree.map(np.asarray, slope(x)), start, jac=True, method="L-BFGS-B")
+    fit = tuning.fit(OBJECTIVE, START, batch, tuned=("range", "bearing"), tolerance=1e-9)
+    assert fit.loss == pytest.approx(found.fun, abs=1e-6)
+    with pytest.raises(ValueError, match="tuned: expected some of"):
+        tuning.coordinates_objective(OBJECTIVE, START, ("speed",))
+
+
+def test_a_minibatch_needs_a_key_and_runs():
+    for size, key in ((2, None), (0, jax.random.key(0)), (5, jax.random.key(0))):
+        with pytest.raises(ValueError, match="minibatch: expected a key and 1 to 4 sequences"):
+            tuning.fit(OBJECTIVE, START, drives(scans=False), minibatch=size, key=key)
+
+
+def test_the_start_is_checked_first():
+    blind = drives(scans=False)
+    blind = blind._replace(inputs=blind.inputs._replace(valid=blind.inputs.valid & False))
+    with pytest.raises(ValueError, match="expected an observation"):
+        tuning.fit(OBJECTIVE, START, blind)
+    with pytest.raises(ValueError, match="positive definite"):
+        tuning.fit(OBJECTIVE, START._replace(Q=-START.Q), drives(scans=False))
+    with pytest.raises(ValueError, match="validation: expected a finite loss"):
+        tuning.fit(OBJECTIVE, START, drives(scans=False), validation=blind)

@@ -1,0 +1,74 @@
+"""Forward mode, whichever is asked for: the same derivatives, of any order, and memory that does not grow."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxlocmap.tuning.forward import forward
+
+
+def walk(few, data):
+    """A loop with a state, which depends on a few numbers nonlinearly, and on integers among its data."""
+
+    def body(x, now):
+        step, count = now
+        x = jnp.sin(few["a"] * x + few["b"] * step) + 0.1 * x * count.astype(x.dtype)
+        return x, jnp.sum(x**2)
+
+    last, squares = jax.lax.scan(body, data["start"], (data["steps"], data["counts"]))
+    return {"last": last, "total": jnp.sum(squares)}
+
+
+def material(length):
+    steps = jnp.asarray(np.random.default_rng(0).normal(size=length))
+    return {"start": jnp.array([0.3, -0.2]), "steps": steps, "counts": jnp.arange(length) % 3}
+
+
+FEW = {"a": jnp.array(0.7), "b": jnp.array([0.4, 1.1])}
+
+
+def total(f):
+    return lambda few, data: f(few, data)["total"]
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, jax.jacfwd, jax.hessian])
+def test_derivatives_by_the_few_are_the_plain_ones(derivative, tolerance):
+    got = derivative(total(forward(walk)))(FEW, material(7))
+    expected = derivative(total(walk))(FEW, material(7))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance(1e-11, 1e-4), atol=1e-6), got, expected)
+
+
+def test_data_have_derivatives_too(tolerance):
+    data = material(5)
+
+    def by_steps(f):
+        return lambda few, steps: f(few, data | {"steps": steps})["total"]
+
+    for argnums in (1, (0, 1)):
+        got = jax.grad(by_steps(forward(walk)), argnums)(FEW, data["steps"])
+        expected = jax.grad(by_steps(walk), argnums)(FEW, data["steps"])
+        jax.tree.map(
+            lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance(1e-11, 1e-4), atol=1e-6), got, expected
+        )
+
+
+def test_it_maps_over_runs(tolerance):
+    batch = {
+        "start": jnp.ones((4, 2)) * jnp.arange(4.0)[:, None],
+        "steps": jnp.ones((4, 5)),
+        "counts": jnp.ones((4, 5), int),
+    }
+    got = jax.vmap(jax.grad(total(forward(walk))), in_axes=(None, 0))(FEW, batch)
+    expected = jax.vmap(jax.grad(total(walk)), in_axes=(None, 0))(FEW, batch)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=tolerance(1e-11, 1e-4), atol=1e-6), got, expected)
+
+
+def test_memory_of_a_gradient_does_not_grow_with_the_loop():
+    def bytes_of(f, length):
+        compiled = jax.jit(jax.grad(total(f))).lower(FEW, material(length)).compile()
+        return compiled.memory_analysis().temp_size_in_bytes
+
+    assert bytes_of(walk, 4000) > 5 * bytes_of(walk, 250)  # plain reverse mode, for comparison
+    # What is left that grows are the squares the loop hands out, one number a step.
+    assert bytes_of(forward(walk), 4000) < bytes_of(walk, 4000) / 3

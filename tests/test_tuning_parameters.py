@@ -1,0 +1,55 @@
+"""Coordinates: there and back, nothing invalid anywhere, and what people call the parameters."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxlocmap import Params
+from jaxlocmap.tuning import NAMES, UNITS, constrain, natural, unconstrain
+
+TILTED = Params(
+    Q=jnp.array([[0.04, -0.003], [-0.003, 0.01]]),
+    R=jnp.array([[0.02, 0.004], [0.004, 0.003]]),
+    l_occ=jnp.array(0.7),
+    l_free=jnp.array(-2.1),
+)
+
+
+def test_there_and_back(tolerance):
+    back = constrain(unconstrain(TILTED))
+    for name, got, expected in zip(Params._fields, back, TILTED, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=tolerance(1e-13, 2e-5), err_msg=name)
+
+
+@given(st.lists(st.floats(-1e30, 1e30, allow_nan=False), min_size=8, max_size=8))
+def test_no_coordinates_are_invalid(values):
+    params = constrain(dict(zip(NAMES, map(jnp.asarray, values), strict=True)))
+    params.check()
+    correlations = [natural(params)[name] for name in ("v_w", "range_bearing")]
+    assert all(abs(float(r)) <= 0.996 for r in correlations)
+
+
+def test_people_call_them_by_these_names(tolerance):
+    got = natural(TILTED)
+    assert tuple(got) == NAMES == tuple(UNITS)
+    expected = (0.2, 0.1, -0.003 / 0.02, 0.02**0.5, 0.003**0.5, 0.004 / (0.02 * 0.003) ** 0.5, 0.7, -2.1)
+    np.testing.assert_allclose([float(x) for x in got.values()], expected, rtol=tolerance(1e-12, 1e-5))
+
+
+def test_a_coordinate_is_the_logarithm_of_a_deviation(tolerance):
+    params = Params.from_std(v=0.02, w=0.05, range=0.08, bearing=0.02)
+    moved = constrain({name: x + jnp.log(2.0) for name, x in unconstrain(params).items() if name[0] != "_"})
+    assert float(natural(moved)["l_free"]) == pytest.approx(-0.8, rel=tolerance(1e-12, 1e-5))
+    longer = unconstrain(params) | {"w": unconstrain(params)["w"] + jnp.log(3.0)}
+    assert float(natural(constrain(longer))["w"]) == pytest.approx(0.15, rel=tolerance(1e-12, 1e-5))
+
+
+def test_at_its_limit_a_coordinate_has_no_slope():
+    at = unconstrain(TILTED) | {"v": jnp.asarray(100.0)}
+    slope = jax.grad(lambda c: constrain(c).Q[0, 0])(at)
+    assert float(slope["v"]) == 0
+    inside = jax.grad(lambda c: constrain(c).Q[0, 0])(unconstrain(TILTED))
+    assert float(inside["v"]) > 0
