@@ -23,6 +23,14 @@ ONLY_POSES = SHORT.config(motion="euler", gate_probability=0.9999, grid=False)
 
 
 @functools.cache
+def _simulated(runs, seed):
+    with jax.ensure_compile_time_eval():  # kept, so no part of whatever is traced when it is first asked for
+        return tuning.simulated(
+            jax.random.key(seed), runs, simulate.room(), simulate.Noise(), scenario=SHORT, scans=True
+        )
+
+
 def drives(runs=4, seed=0, scans=True):
     """A batch of simulated drives."""
-    return tuning.simulated(jax.random.key(seed), runs, simulate.room(), simulate.Noise(), scenario=SHORT, scans=scans)
+    batch = _simulated(runs, seed)
+    return batch if scans else batch._replace(inputs=batch.inputs._replace(ranges=None), beam_angles=None)

@@ -324,9 +324,7 @@ def plain_update(mean, cov, residual, H, R):
     return mean + K @ residual, A @ cov @ A.T + K @ R @ K.T, S, nis, log_likelihood
 
 
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("dimension", [1, 2])
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize(("order", "dimension", "mode"), [(1, 1, jax.jacfwd), (2, 2, jax.jacfwd), (1, 2, jax.jacrev)])
 def test_derivatives_by_hand_are_those_of_the_formulas(order, dimension, mode, x64):
     rng = np.random.default_rng(dimension)
     spread = rng.normal(size=(dimension, dimension))
@@ -349,7 +347,7 @@ def test_derivatives_by_hand_are_those_of_the_formulas(order, dimension, mode, x
 
         for _ in range(order):
             f = mode(f)
-        return f(0.0)
+        return jax.jit(f)(0.0)
 
     def by_hand(*args):
         update = ekf.update(*args)

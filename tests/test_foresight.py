@@ -60,7 +60,7 @@ def test_it_is_what_plain_loops_give(counted, tolerance):
 def test_a_map_that_knows_nothing_pays_log_two_a_cell(tolerance):
     poses, ranges = drive()
     args = (jnp.zeros(SPEC.shape), *map(jnp.asarray, (poses[0], ranges[0], ANGLES)))
-    loss, cells = scan_log_loss(*args, spec=SPEC, **LIMITS)
+    loss, cells = jax.jit(lambda *args: scan_log_loss(*args, spec=SPEC, **LIMITS))(*args)
     assert float(loss) == pytest.approx(float(cells) * np.log(2), rel=tolerance(1e-13, 1e-6))
 
 

@@ -9,7 +9,7 @@ from drives import ONLY_POSES, OWN, drives
 from jaxlocmap import Gaussian, tuning
 from jaxlocmap.tuning.losses import tallies
 
-LOSSES = ("innovation", "pose", "state", "nees", "nis")
+LOSSES = ("innovation", "pose")
 
 
 @jax.jit

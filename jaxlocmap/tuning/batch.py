@@ -169,9 +169,8 @@ def simulated(
         worlds: `world` leads with an axis of runs, a world each, whose landmarks are all the same.
     """
     prior = scenario.prior()
-    drive = functools.partial(_drive, scenario=scenario, scans=scans)
-    axes = (0, 0 if worlds else None, None, None)
-    truth, inputs = jax.jit(jax.vmap(drive, in_axes=axes))(jax.random.split(key, runs), world, noise, prior)
+    keys = jax.random.split(key, runs)
+    truth, inputs = _drives(keys, world, noise, prior, scenario=scenario, scans=scans, worlds=worlds)
     counted = jnp.ones(inputs.dt.shape, bool)
     return Batch(
         prior=jax.tree.map(lambda x: jnp.broadcast_to(x, (runs, *x.shape)), prior),
@@ -184,18 +183,23 @@ def simulated(
     )
 
 
-def _drive(
-    key: jax.Array,
+@functools.partial(jax.jit, static_argnames=("scenario", "scans", "worlds"))
+def _drives(
+    keys: jax.Array,
     world: World,
     noise: simulate.Noise,
     prior: Gaussian,
     *,
     scenario: simulate.Scenario,
     scans: bool,
+    worlds: bool,
 ) -> tuple[Any, Inputs]:
-    start_key, key = jax.random.split(key)
-    start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
-    return simulate.simulate(key, world, noise, start, scenario=scenario, scan=scans)
+    def one(key: jax.Array, world: World) -> tuple[Any, Inputs]:
+        start_key, key = jax.random.split(key)
+        start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
+        return simulate.simulate(key, world, noise, start, scenario=scenario, scan=scans)
+
+    return jax.vmap(one, in_axes=(0, 0 if worlds else None))(keys, world)
 
 
 def _apart_from_shared(batch: Batch) -> Batch:

@@ -25,6 +25,7 @@ def forward(f: Callable[..., Any]) -> Callable[..., Any]:
 
     Source: Gupta & Mehra 1974 (the sensitivity equations of a filter).
     """
+    f = jax.jit(f)  # traced once, however often it is differentiated
 
     @jax.custom_jvp
     def with_forward(few: Any, data: Any) -> Any:
