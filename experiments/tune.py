@@ -16,7 +16,7 @@ import optax
 from common import CONSOLE, command_line, output_folder, saved, write_report
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
-from tune_sources import Source, Wanted, from_robots, from_scans, from_scenario
+from tune_sources import JUDGE_GATE, TUNING_GATE, Source, Wanted, from_robots, from_scans, from_scenario
 
 from jaxlocmap import Params, hosts, plotting, tuning
 from jaxlocmap.consistency import readable
@@ -51,10 +51,10 @@ class TuneConfig:
     """Simulated runs to tune on."""
     judge_runs: int = 2000
     """Fresh runs to judge by."""
-    gate: float | None = 0.9999
+    gate: float | None = TUNING_GATE
     """The gate while tuning, which weighs readings instead of deciding. It is for what is surely false: one that also
     refuses a good reading in a hundred pulls the result by some per cent."""
-    judge_gate: float | None = 0.99
+    judge_gate: float | None = JUDGE_GATE
     """The gate the result is judged with."""
     max_range: float | None = None
     """Sightings at or beyond are left out, m; of a laser, where its beams end (20 m by default)."""
@@ -93,12 +93,14 @@ def main(config: TuneConfig) -> dict[str, Any]:
     weights = _weights(config.loss)
     losses = tuple(name for name, _ in weights)
     hosts.use_all_cores()
+    jax.config.update("jax_disable_most_optimizations", config.quick)  # a quick run does little but compile
     with jax.enable_x64(True):
         source = _source(config, losses)
         objective = tuning.Objective(source.config, weights)
         tuned = _tuned(config, losses)
         CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds", highlight=False)
         found = _fit(config, objective, source, tuned, out)
+        write_report(out, {"source": source.name, "losses": dict(weights), **_descent(config, found)})
         CONSOLE.print("judging what was held out, before and after; standard errors", highlight=False)
         sure = tuning.certainty(objective, found.params, source.compared, tuned)
         report = {
@@ -214,13 +216,12 @@ def _parameters(start: Params, end: Params, sure: tuning.Certainty) -> dict[str,
 
 
 def _losses(objective: tuning.Objective, source: Source, end: Params) -> dict[str, dict[str, Any]]:
-    judge = jax.jit(objective)
     rows: dict[str, dict[str, Any]] = {name: {} for name in objective.names}
     for when, params in (("before", source.start), ("after", end)):
         for which, batch in (("train", source.train), ("validation", source.validation)):
-            terms = {} if batch is None else judge(params, batch)[1]
+            terms = {} if batch is None else objective.judged(params, batch)[1]
             for name in rows:
-                rows[name][f"{which}_{when}"] = float(terms[name]) if name in terms else None
+                rows[name][f"{which}_{when}"] = terms.get(name)
     return rows
 
 

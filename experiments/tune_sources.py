@@ -22,6 +22,8 @@ from jaxlocmap.study import Study, summarise
 from jaxlocmap.world import random_room
 
 Evidence = dict[str, Any]
+TUNING_GATE, JUDGE_GATE = 0.9999, 0.99
+_LOST_STD = (1.0, 1.0, 0.5)  # m, m, rad: how far off a window may start where no truth is known
 GATE_SOFTNESS = 2.0  # while tuning, of the squared distance; the gate itself is at 18.4, for a probability of 0.9999
 _HELD_OUT_WORLDS = 64
 _BLOCKS = 10  # of the scans of one map, for its standard errors
@@ -39,7 +41,7 @@ class Source(NamedTuple):
     config: Config  # while tuning
     train: tuning.Batch
     validation: tuning.Batch | None
-    compared: tuning.Batch  # sequences independent of each other, whose spread makes the standard errors
+    compared: tuning.Batch  # what is tuned on, in the parts whose spread makes the standard errors
     evidence: Callable[[Params], Evidence]  # of parameters, on what is held out
     dt: float
 
@@ -116,16 +118,17 @@ def from_robots(
         log, timeline = _timeline(path, kind, None, max_range, wanted.quick)
         half = len(timeline.time) // 2
         drives = [(log, _cut(timeline, 0, half))]
-        held_out = {"second half": (log, _cut(timeline, half, None))}
+        held_out = {"second half": (log, _from_truth(_cut(timeline, half, None)))}
     else:
-        if not robots or set(robots) & set(judged):
+        if not robots or not judged or set(robots) & set(judged):
             raise ValueError(
                 f"robots, judged: expected robots to tune on and others to judge, got {robots} and {judged}"
             )
         drives = [_timeline(path, kind, robot, max_range, wanted.quick) for robot in robots]
         held_out = {f"robot {robot}": _timeline(path, kind, robot, max_range, wanted.quick) for robot in judged}
     log = drives[0][0]
-    filter_config = Config(dt=PERIOD, motion=motion, sensor_offset=offset_of(log.sensor_offset))
+    reach = max_range or Config.max_range
+    filter_config = Config(dt=PERIOD, motion=motion, sensor_offset=offset_of(log.sensor_offset), max_range=reach)
     config = _tuning(dataclasses.replace(filter_config, gate_probability=wanted.gate))
     start = wanted.start or believed(log)
     length, run_in = _WINDOWS[kind]
@@ -138,7 +141,7 @@ def from_robots(
         return {name: _judged(params, *drive, judged_config) for name, drive in held_out.items()}
 
     said = f"{path.name}" + (f", robots {', '.join(map(str, robots))}" if kind == "mrclam" else ", first half")
-    return Source(said, start, config, train, validation, cut, evidence, PERIOD)
+    return Source(said, start, config, train, validation, train, evidence, PERIOD)
 
 
 def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) -> Source:
@@ -180,7 +183,7 @@ def _tuning(config: Config) -> Config:
 
 def _scans(log: Log, count: int) -> tuning.Batch:
     inputs = tuning.no_observations(count)._replace(ranges=log.scan[:count])
-    prior = Gaussian(log.truth[0], np.diag(np.array(PRIOR_STD) ** 2))
+    prior = _prior(log.truth[0])
     return tuning.sequence(inputs, prior, beam_angles=log.beam_angles, poses=log.truth[:count])
 
 
@@ -189,7 +192,7 @@ def _timeline(path: Path, kind: str, robot: int | None, max_range: float | None,
     if not len(log.landmarks):
         raise ValueError(f"{path}: expected landmarks to localise by, got none (format {kind})")
     if not len(log.truth_time):
-        raise ValueError(f"{path}: expected a log with truth, to start from and to judge by, got none")
+        raise ValueError(f"{path}: expected a log with truth, to start from, to judge by and for some losses, got none")
     timeline = to_timeline(log, max_range=max_range, start=float(log.truth_time.min()))
     return log, _cut(timeline, 0, 6000 if kind == "mrclam" else 2400) if quick else timeline
 
@@ -198,12 +201,17 @@ def _cut(timeline: Timeline, begin: int, end: int | None) -> Timeline:
     return jax.tree.map(lambda x: x[begin:end], timeline._replace(counts={}))
 
 
+def _from_truth(timeline: Timeline) -> Timeline:
+    """From the first step on at which the truth is known, to start from."""
+    return _cut(timeline, int(np.argmax(timeline.truth_valid)), None)
+
+
 def _prior(pose: np.ndarray) -> Gaussian:
     return Gaussian(jnp.asarray(pose), jnp.diag(jnp.array(PRIOR_STD) ** 2))
 
 
 def _windows(timeline: Timeline, log: Log, start: Params, config: Config, length: int, run_in: int) -> tuning.Batch:
-    """Windows that start at the truth where it is known, and elsewhere where the filter believes to be."""
+    """Windows that start at the truth where it is known, and elsewhere roughly where the filter believes to be."""
     whole = tuning.sequence(
         timeline.inputs,
         _prior(first_pose(log, timeline)),
@@ -211,11 +219,12 @@ def _windows(timeline: Timeline, log: Log, start: Params, config: Config, length
         truth=timeline.truth,
         known=timeline.truth_valid,
     )
-    mean = np.where(timeline.truth_valid[:, None], timeline.truth, 0)[None]
+    mean: Any = np.where(timeline.truth_valid[:, None], timeline.truth, 0)[None]
     if not timeline.truth_valid.all():
         means = np.asarray(jax.jit(tuning.beliefs, static_argnames="config")(start, whole, config=config).mean)
         mean = np.where(timeline.truth_valid[:, None], mean, means)
-    cov = np.broadcast_to(np.diag(np.array(PRIOR_STD) ** 2), (*mean.shape, 3))
+    spread = np.where(timeline.truth_valid[:, None], PRIOR_STD, _LOST_STD)[None] ** 2
+    cov: Any = spread[..., None] * np.eye(3)
     return tuning.windows(whole, length, run_in=run_in, beliefs=Gaussian(mean, cov))
 
 

@@ -23,12 +23,12 @@ _LEAST_WEIGHT = 1e-6  # of an observation at a soft gate: an R of a million time
 class Update(NamedTuple):
     """What a correction made of one observation of dimension m."""
 
-    mean: jax.Array  # (3,) m, m, rad; unchanged where not accepted
-    cov: jax.Array  # (3, 3); unchanged where not accepted
+    mean: jax.Array  # (3,) m, m, rad; unchanged where not accepted, unless the gate is soft
+    cov: jax.Array  # (3, 3); likewise
     innovation: jax.Array  # (m,)
     S: jax.Array  # (m, m) covariance of the innovation
     nis: jax.Array  # () squared Mahalanobis distance of the innovation; NaN where S is not positive definite
-    accepted: jax.Array  # () bool
+    accepted: jax.Array  # () bool: below the threshold
     log_likelihood: jax.Array  # () nats, log N(innovation; 0, S)
 
 

@@ -53,7 +53,10 @@ def scan_log_loss(
     Raises:
         ValueError: a wrong shape.
     """
-    ends, crossed = _before(log_odds, pose, ranges, beam_angles, spec, min_range, max_range)
+    return _log_loss(*_before(log_odds, pose, ranges, beam_angles, spec, min_range, max_range))
+
+
+def _log_loss(ends: _Cells, crossed: _Cells) -> tuple[jax.Array, jax.Array]:
     loss = jnp.sum(jnp.where(ends.seen, jax.nn.softplus(-ends.log_odds), 0))
     loss = loss + jnp.sum(jnp.where(crossed.seen, jax.nn.softplus(crossed.log_odds), 0))
     return loss, (jnp.sum(ends.seen) + jnp.sum(crossed.seen)).astype(loss.dtype)
@@ -98,10 +101,11 @@ def foresee(
         carry: tuple[jax.Array, Foresight], now: tuple[jax.Array, ...]
     ) -> tuple[tuple[jax.Array, Foresight], None]:
         (log_odds, total), (pose, scan, counts) = carry, now
-        loss, cells = scan_log_loss(log_odds, pose, scan, beam_angles, spec=spec, **limits)
+        ends, crossed = _before(log_odds, pose, scan, beam_angles, spec, **limits)
+        loss, cells = _log_loss(ends, crossed)
         binned = (total.bin_cells, total.bin_probability, total.bin_hits)
         if bins:
-            more = _binned(*_before(log_odds, pose, scan, beam_angles, spec, **limits))
+            more = _binned(ends, crossed)
             binned = tuple(a + jnp.where(counts, b, 0) for a, b in zip(binned, more, strict=True))
         total = Foresight(
             total.log_loss + jnp.where(counts, loss, 0), total.cells + jnp.where(counts, cells, 0), *binned

@@ -222,7 +222,7 @@ class Info(NamedTuple):
     innovation: jax.Array  # (M, 2) m, rad: z minus its prediction, bearing wrapped
     S: jax.Array  # (M, 2, 2) covariance of the innovation
     nis: jax.Array  # (M,) squared Mahalanobis distance of the innovation, gated or not
-    accepted: jax.Array  # (M,) bool: the gate let it in
+    accepted: jax.Array  # (M,) bool: the gate let it in; a soft one would give it half its weight or more
     log_likelihood: jax.Array  # (M,) nats: log density of the innovation, gated or not
     row: jax.Array  # (M,) int32: row of `landmarks` the observation was taken for, -1 in an empty slot
     ok: jax.Array  # () bool: inputs finite, covariance positive semi-definite

@@ -33,7 +33,10 @@ def room() -> World:
 
 
 def random_room(key: jax.Array) -> World:
-    """`room` with its box elsewhere, its sides 1 to 4 m long. The same landmarks."""
+    """`room` with its box elsewhere, half a metre or more from the walls, its sides 1 to 4 m long. The same landmarks.
+
+    A drive may lead through the box, as that of the capstone scenario does in `room`: the plant knows no collisions.
+    """
     plain = room()
     low, high, margin = 0.0, 12.0, 0.5
     sizes, places = jax.random.uniform(key, (2, 2), plain.segments.dtype)

@@ -34,7 +34,7 @@ def test_it_is_the_sandwich_of_differences(x64):
     hessian = np.stack([(gradient(at + d, none) - gradient(at - d, none)) / 2e-3 for d in 1e-3 * np.eye(2)])
     influence = np.stack([(gradient(at, e) - gradient(at, -e)) / 2e-3 for e in 1e-3 * np.eye(4)])
     sure = tuning.certainty(objective, OWN, batch, (*NAMES, "l_occ"))
-    assert sure.words == ("l_occ: the loss does not depend on it here",)
+    assert "l_occ: the loss does not depend on it here" in sure.words
     assert np.isinf(sure.standard_error[2])
     np.testing.assert_allclose(sure.hessian[:2, :2], hessian, rtol=1e-3, atol=1e-4 * np.abs(hessian).max())
     inverse = np.linalg.inv(hessian)
@@ -48,17 +48,22 @@ def test_a_scale_that_is_left_open_is_named():
     together = np.ones(4) / 2
     hessian = np.eye(4) - np.outer(together, together)
     influence = np.random.default_rng(0).normal(size=(9, 4)) * 0.1
-    open_scale = _judge(tuning.NOISE, np.ones(4), hessian, influence, np.eye(4))
+    open_scale = _judge(tuning.NOISE, np.ones(4), np.zeros(4), hessian, influence, np.eye(4))
     assert open_scale.words == ("v, w, range, bearing can change together: the loss stays the same",)
     assert np.isinf(open_scale.standard_error).all()
 
 
 def test_vague_and_tied_parameters_are_named():
     influence = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    vague = _judge(("v", "w"), np.ones(2), np.diag([1.0, 100.0]), influence, np.eye(2))
-    assert vague.words[0].startswith("v: the data does not tell its order of magnitude")
-    assert len(vague.words) == 1
-    tied = _judge(("v", "w"), np.ones(2), 1e3 * np.array([[1.0, 0.97], [0.97, 1.0]]), influence, np.eye(2))
+    still, names = np.zeros(2), ("v", "w")
+    vague = _judge(names, np.ones(2), still, np.diag([1.0, 100.0]), influence, np.eye(2))
+    assert vague.words == ("v: known to no more than a factor of 5.1 (one standard error)",)  # exp(sqrt(2 * 4 / 3))
+    moving = _judge(names, np.ones(2), np.array([0.0, 50.0]), np.diag([100.0, 100.0]), influence, np.eye(2))
+    assert moving.words == ("w: not yet at its minimum, some 31 standard errors away",)  # 0.5 / (sqrt(8 / 3) / 100)
+    saddle = _judge(names, np.ones(2), still, np.diag([100.0, -50.0]), influence, np.eye(2))
+    assert saddle.words == ("w: no minimum, the loss falls further along here",)
+    assert np.isinf(saddle.standard_error[1])
+    tied = _judge(names, np.ones(2), still, 1e3 * np.array([[1.0, 0.97], [0.97, 1.0]]), influence, np.eye(2))
     assert tied.words[0].startswith("w and v: known in combination")
 
 

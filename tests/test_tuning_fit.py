@@ -1,6 +1,7 @@
 """The descent: what it finds, keeps and counts, and what it refuses."""
 
 import dataclasses
+import math
 
 import jax
 import jax.numpy as jnp
@@ -18,19 +19,20 @@ START = simulate.course_params()
 
 
 def test_it_finds_the_robots_own_noise(x64):
-    """Of 400 drives with one reading in twenty false: to four of the standard errors it claims, and to 2 % for what the
-    gate's decision hides from the gradient.
+    """Of 400 drives with one reading in twenty false. A deviation of n errors is known to 1 / sqrt(2 n) of itself; four
+    times that, and 2 % for readings that are false but near enough to be half believed. The yaw rate shows up in few of
+    so short drives.
     """
     lying = dataclasses.replace(SHORT, name="lying", steps=40, outliers=True)
     noise = simulate.Noise(outlier_rate=0.05)
     batch = tuning.simulated(jax.random.key(4), 400, simulate.room(), noise, scenario=lying)
-    objective = tuning.Objective(dataclasses.replace(ONLY_POSES, gate_softness=2.0), (("innovation", 1.0),))
-    fit = tuning.fit(objective, START, batch)
-    sure = tuning.certainty(objective, fit.params, batch, tuning.NOISE)
-    truth = np.array([float(tuning.natural(OWN)[name]) for name in tuning.NOISE])
-    assert np.all(np.abs(sure.estimate - truth) < 4 * sure.standard_error + 0.02 * truth)
-    assert np.all(sure.standard_error < 0.2 * truth)
-    assert sure.words == ()
+    soft = dataclasses.replace(ONLY_POSES, gate_softness=2.0)
+    fit = tuning.fit(tuning.Objective(soft, (("innovation", 1.0),)), START, batch)
+    found, own = ({k: float(x) for k, x in tuning.natural(params).items()} for params in (fit.params, OWN))
+    known = 4 / math.sqrt(2 * float(np.sum(np.asarray(batch.inputs.valid))))
+    for name in ("range", "bearing"):
+        assert found[name] == pytest.approx(own[name], rel=known + 0.02), name
+    assert found["w"] == pytest.approx(own["w"], rel=0.1)
     assert fit.stopped_early
     assert fit.losses[fit.best_epoch] == fit.loss == min(fit.losses)
     assert not fit.trace.skipped.any()
@@ -92,6 +94,17 @@ def test_scipy_takes_the_same_gradient(x64):
     assert np.all(np.abs(found.jac) < 1e-3)
     with pytest.raises(ValueError, match="tuned: expected some of"):
         tuning.coordinates_objective(OBJECTIVE, START, ("speed",))
+
+
+@pytest.mark.parametrize("name", ["epochs", "steps", "patience"])
+def test_no_epochs_and_no_steps_are_refused(name):
+    with pytest.raises(ValueError, match=f"{name}: expected at least 1, got 0"):
+        tuning.fit(OBJECTIVE, START, drives(scans=False), **{name: 0})
+
+
+def test_a_start_beyond_the_limits_is_refused():
+    with pytest.raises(ValueError, match=r"range: expected a value within the limits of tuning.*got 1e\+06"):
+        tuning.fit(OBJECTIVE, START._replace(R=START.R * jnp.array([[1e12 / 0.0225, 0], [0, 1]])), drives(scans=False))
 
 
 def test_a_minibatch_needs_a_key_and_runs():

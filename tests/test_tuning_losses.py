@@ -13,7 +13,8 @@ from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives
 
 from jaxlocmap import Params, simulate, tuning
 from jaxlocmap.tuning import losses
-from jaxlocmap.tuning.losses import LOSSES, filtered
+from jaxlocmap.tuning.filtering import filtered
+from jaxlocmap.tuning.losses import LOSSES
 
 OTHER = Params.from_std(v=0.05, w=0.1, range=0.12, bearing=0.01, l_free=-0.43)  # ten times -0.4 is just l_min
 
@@ -152,9 +153,11 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     missed = {}
     for softness in (0.0, 2.0):
         config = dataclasses.replace(ONLY_POSES, gate_softness=softness)
-        f = tuning.coordinates_objective(tuning.Objective(config, (("innovation", 1.0),)), OWN, ("w",))
-        value, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda w, f=f: f({"w": w}, batch)[0])))(
-            own["w"] + h * jnp.asarray([-1, *places, 1])
+        objective = tuning.Objective(config, (("innovation", 1.0),))
+        f = lambda at, batch, objective=objective: objective(tuning.constrain(own | at), batch)  # noqa: E731
+        places_w = own["w"] + h * jnp.asarray([-1, *places, 1])
+        value, slope = jax.jit(jax.vmap(lambda w, f=f: jax.jvp(lambda w: f({"w": w}, batch)[0], (w,), (1.0,))))(
+            places_w
         )
         change, added_up = float(value[-1] - value[0]), h * float(np.sum(weights * np.asarray(slope[1:-1])))
         missed[softness] = abs(change - added_up) / (2 * h)

@@ -2,6 +2,7 @@
 
 losses.py      what a filter can be tuned for, and `Objective`, a weighted sum
 batch.py       what it is tuned on: sequences, padding, windows
+filtering.py   the filter over all of them
 parameters.py  coordinates in which nothing invalid exists
 forward.py     derivatives by few numbers through long loops
 fit.py         the descent
@@ -10,8 +11,9 @@ certainty.py   standard errors, correlations, and what the data cannot tell
 
 from jaxlocmap.tuning.batch import Batch, blocks, join, no_observations, pick, sequence, simulated, windows
 from jaxlocmap.tuning.certainty import Certainty, certainty
+from jaxlocmap.tuning.filtering import beliefs
 from jaxlocmap.tuning.fit import Fit, coordinates_objective, fit
-from jaxlocmap.tuning.losses import LOSSES, Objective, beliefs
+from jaxlocmap.tuning.losses import LOSSES, Objective
 from jaxlocmap.tuning.parameters import FULL_NOISE, NAMES, NOISE, SENSOR_MODEL, UNITS, constrain, natural, unconstrain
 
 __all__ = [

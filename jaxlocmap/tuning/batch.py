@@ -45,7 +45,10 @@ def sequence(
     Args:
         inputs: leading axis T. prior: mean (3,), cov (3, 3). landmarks: (L, 2) m. truth: (T, 3) m, m, rad, of which
             `known` (T,) says where it may be used: everywhere it is finite by default. beam_angles: (B,) rad.
-            poses: (T, 3), where to map the scans.
+            poses: (T, 3) m, m, rad, where to map the scans.
+
+    Returns:
+        `Batch` with N = 1. What does not fit is found by whatever uses it.
     """
     if truth is not None and known is None:
         known = np.all(np.isfinite(truth), axis=-1)
@@ -58,14 +61,9 @@ def sequence(
 
 
 def no_observations(steps: int) -> Inputs:
-    """Inputs of a robot that stands still and sees nothing, to fill in what it did measure."""
-    return Inputs(
-        dt=np.zeros(steps),
-        control=np.zeros((steps, 2)),
-        landmark=np.zeros((steps, 0), np.int32),
-        z=np.zeros((steps, 0, 2)),
-        valid=np.zeros((steps, 0), bool),
-    )
+    """Inputs (T,) of a robot that stands still and sees nothing, to fill in what it did measure; no slots."""
+    arrays: Any = (np.zeros(steps), np.zeros((steps, 2)), np.zeros((steps, 0), np.int32), np.zeros((steps, 0, 2)))
+    return Inputs(*arrays, valid=np.asarray(arrays[2], bool))  # type: ignore[arg-type]
 
 
 def join(*batches: Batch) -> Batch:
@@ -147,7 +145,7 @@ def blocks(batch: Batch, count: int) -> Batch:
 
 
 def pick(batch: Batch, rows: Any) -> Batch:
-    """The sequences in these rows (an array, a mask or a slice), without padding that none of them needs."""
+    """The sequences in these rows: an array, a mask or a slice. Also under jit, with an array of rows."""
     some = jax.tree.map(lambda x: x[rows], _apart_from_shared(batch))
     return some._replace(**{name: getattr(batch, name) for name in _SHARED})
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,8 +13,10 @@ from jaxlocmap.tuning.losses import Objective
 from jaxlocmap.tuning.parameters import NAMES, constrain, natural, unconstrain
 from jaxlocmap.types import Params
 
-_VAGUE = 1.0  # a standard error of the logarithm above this: not even the order of magnitude
+_VAGUE = 1.0  # a standard error of a coordinate above this is said in words
 _TIED = 0.95  # a correlation above this: only a combination is known
+_FLAT = 1e-6  # of the largest curvature: none
+_PART = 0.1  # of a direction's unit length: a parameter that has a part in it
 
 
 class Certainty(NamedTuple):
@@ -36,10 +38,12 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
     H is the Hessian of the objective by the coordinates, g_n the derivative of its gradient by how much sequence n
     counts: the infinitesimal jackknife, which for a mean is the usual sandwich. It needs nothing but sequences that are
     independent of each other, so it holds for every loss and where the filter's model does not; for errors that are
-    correlated in time make the windows longer than the correlation.
+    correlated in time make the windows longer than the correlation. The blocks of one map are not independent: each
+    finds the map that those before it have made. The Hessian leaves out the kinks at the bounds of a map's log-odds.
 
     Args:
-        params: where the objective is at its minimum. batch: of at least two sequences, what it was tuned on.
+        params: where the objective is at its minimum; where it is not, the words say so. batch: of at least two
+            sequences, what it was tuned on. tuned: which of `parameters.NAMES`.
 
     Raises:
         ValueError: fewer than two sequences, or nothing to tune.
@@ -79,36 +83,48 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
         hessian = hessian + jnp.einsum("kl,ki,lj->ij", bend, slope_of_sum, slope_of_sum)
         influence = jnp.einsum("k,nki->ni", weight, slope) + jnp.einsum("kl,nl,ki->ni", bend, each, slope_of_sum)
         scale = jax.jacfwd(lambda x: jnp.stack([natural(at(x))[name] for name in tuned]))(theta)
-        return hessian, influence, scale
+        return jnp.einsum("k,ki->i", weight, slope_of_sum), hessian, influence, scale
 
-    hessian, influence, scale = (np.asarray(x, np.float64) for x in derivatives(theta, batch))
+    gradient, hessian, influence, scale = (np.asarray(x, np.float64) for x in derivatives(theta, batch))
     estimate = np.array([float(natural(params)[name]) for name in tuned])
-    return _judge(tuned, estimate, 0.5 * (hessian + hessian.T), influence, scale)
+    return _judge(tuned, estimate, gradient, 0.5 * (hessian + hessian.T), influence, scale)
 
 
 def _judge(
-    names: tuple[str, ...], estimate: np.ndarray, hessian: np.ndarray, influence: np.ndarray, scale: np.ndarray
+    names: tuple[str, ...],
+    estimate: np.ndarray,
+    gradient: np.ndarray,
+    hessian: np.ndarray,
+    influence: np.ndarray,
+    scale: np.ndarray,
 ) -> Certainty:
     n = len(influence)
     meat = influence.T @ influence * n / (n - 1)
     curvature, axes = np.linalg.eigh(hessian)
     # Along an axis of no curvature any value does as well; what lies along it has no error, or an infinite one.
-    flat = curvature <= 1e-6 * np.max(np.abs(curvature), initial=1e-300)
-    inverse = (axes[:, ~flat] / curvature[~flat]) @ axes[:, ~flat].T
+    steep = np.max(np.abs(curvature), initial=1e-300)
+    bent, flat = curvature > _FLAT * steep, np.abs(curvature) <= _FLAT * steep
+    inverse = (axes[:, bent] / curvature[bent]) @ axes[:, bent].T
     cov = inverse @ meat @ inverse
-    lost = (np.abs(axes[:, flat]) > 0.1).any(axis=1)
-    vague = lost | ~(np.sqrt(np.diag(cov)) < _VAGUE)
+    lost: np.ndarray = np.any(np.abs(axes[:, ~bent]) > _PART, axis=1)
     natural_cov = scale @ cov @ scale.T
     error = np.sqrt(np.maximum(np.diag(natural_cov), 0))
     safe = np.where(error > 0, error, 1)
     correlation = natural_cov / np.outer(safe, safe)
+    to_go = np.abs(inverse @ gradient)  # a Newton step
     words = [_tied(names, axes[:, i]) for i in np.flatnonzero(flat)]
     words += [
-        f"{name}: the data does not tell its order of magnitude (its logarithm has a standard error of "
-        f"{np.sqrt(cov[i, i]):.2g})"
-        for i, name in enumerate(names)
-        if vague[i] and not lost[i]
+        f"{_together(names, axes[:, i])}: no minimum, the loss falls further along here"
+        for i in np.flatnonzero(~bent & ~flat)
     ]
+    for i, name in enumerate(names):
+        if lost[i]:
+            continue
+        own = np.sqrt(cov[i, i])
+        if own > _VAGUE:
+            words.append(f"{name}: known to no more than a factor of {np.exp(min(own, 99.0)):.2g} (one standard error)")
+        if to_go[i] > own:
+            words.append(f"{name}: not yet at its minimum, some {to_go[i] / own:.2g} standard errors away")
     words += [
         f"{names[i]} and {names[j]}: known in combination, hardly apart (correlation {correlation[i, j]:+.3f})"
         for i in range(len(names))
@@ -120,19 +136,15 @@ def _judge(
 
 def _tied(names: tuple[str, ...], axis: np.ndarray) -> str:
     """What a direction without curvature means."""
+    if np.sum(np.abs(axis) > _PART) == 1:
+        return f"{names[np.argmax(np.abs(axis))]}: the loss does not depend on it here"
+    return f"{_together(names, axis)}: the loss stays the same"
+
+
+def _together(names: tuple[str, ...], axis: np.ndarray) -> str:
+    """A direction in words."""
     axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    up = [name for name, part in zip(names, axis, strict=True) if part > 0.1]
-    down = [name for name, part in zip(names, axis, strict=True) if part < -0.1]
-    if len(up) + len(down) == 1:
-        return f"{up[0]}: the loss does not depend on it here"
-    against = f" against {', '.join(down)}" if down else ""
-    return f"{', '.join(up)} can change together{against}: the loss stays the same"
-
-
-def as_report(certainty: Certainty) -> dict[str, Any]:
-    """By name, ready for JSON."""
-    return {
-        "standard_errors": dict(zip(certainty.names, certainty.standard_error.tolist(), strict=True)),
-        "correlation": certainty.correlation.tolist(),
-        "not_identified": list(certainty.words),
-    }
+    up = [name for name, part in zip(names, axis, strict=True) if part > _PART]
+    down = [name for name, part in zip(names, axis, strict=True) if part < -_PART]
+    together = " can change together" if len(up) + len(down) > 1 else ""
+    return ", ".join(up) + together + (f" against {', '.join(down)}" if down else "")

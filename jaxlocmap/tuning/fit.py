@@ -21,13 +21,13 @@ from jaxlocmap.types import Params
 
 
 class Trace(NamedTuple):
-    """What happened at each step, before it was taken. NumPy, leading axis of steps."""
+    """What happened at each step, before it was taken. NumPy arrays, leading axis of steps."""
 
-    loss: np.ndarray  # (steps,) of the sequences it was taken on
-    gradient_norm: np.ndarray  # (steps,) by the coordinates
-    skipped: np.ndarray  # (steps,) bool: something was not finite, so no step was taken
-    evaluations: np.ndarray  # (steps,) of value and gradient
-    params: dict[str, np.ndarray]  # (steps,) by name, in the units of `parameters.UNITS`
+    loss: Any  # (steps,) of the sequences it was taken on
+    gradient_norm: Any  # (steps,) by the coordinates
+    skipped: Any  # (steps,) bool: something was not finite, so no step was taken
+    evaluations: Any  # (steps,) of value and gradient
+    params: dict[str, Any]  # (steps,) by name, in the units of `parameters.UNITS`
 
 
 class Fit(NamedTuple):
@@ -39,7 +39,7 @@ class Fit(NamedTuple):
     trace: Trace
     best_epoch: int  # 0: the start
     stopped_early: bool
-    compile_s: float
+    compile_s: float  # of the descent
     run_s: float  # without compilation
 
 
@@ -51,16 +51,24 @@ def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str
 
         f = coordinates_objective(objective, params, NOISE)
         start, unravel = ravel_pytree({name: unconstrain(params)[name] for name in NOISE})
-        slope = jax.jit(jax.value_and_grad(lambda x: f(unravel(x), batch)[0]))
-        found = scipy.optimize.minimize(lambda x: jax.tree.map(np.asarray, slope(x)), start, jac=True, method="BFGS")
+        program = jax.jit(jax.value_and_grad(lambda x: f(unravel(x), batch)[0]))
+        slope = lambda x: jax.tree.map(np.asarray, program(x))
+        found = scipy.optimize.minimize(slope, start, jac=True, method="L-BFGS-B")
         tuned = constrain(unconstrain(params) | unravel(found.x))
 
     Raises:
-        ValueError: nothing to tune, or a name that is none of `NAMES`.
+        ValueError: nothing to tune, a name that is none of `NAMES`, or parameters beyond the limits of `constrain`.
     """
     if not tuned or any(name not in NAMES for name in tuned):
         raise ValueError(f"tuned: expected some of {NAMES}, got {tuned}")
     params.check()
+    inside = natural(constrain(unconstrain(params)))
+    for name, value in natural(params).items():
+        if not np.allclose(value, inside[name], rtol=1e-3, atol=1e-3 if name in ("v_w", "range_bearing") else 0):
+            raise ValueError(
+                f"{name}: expected a value within the limits of tuning, the nearest being {float(inside[name]):.3g}, "
+                f"got {float(value):.3g}"
+            )
     fixed = {name: value for name, value in unconstrain(params).items() if name not in tuned}
 
     def at(coordinates: Coordinates, batch: Batch) -> Any:
@@ -82,7 +90,7 @@ def fit(
     key: jax.Array | None = None,
     validation: Batch | None = None,
     patience: int = 2,
-    tolerance: float = 1e-5,
+    tolerance: float = 1e-4,
     progress: Callable[[Fit], None] | None = None,
 ) -> Fit:
     """Tune parameters for an objective.
@@ -96,7 +104,8 @@ def fit(
         steps: of the optimiser in an epoch, one compiled scan.
         minibatch: sequences a step, drawn anew without repetition; all by default. key: of the draws.
         validation: what the best is picked by; the batch itself by default.
-        patience: stop after so many epochs in which the loss fell by less than `tolerance`.
+        patience: stop after so many epochs in which the loss fell by less than `tolerance` of what it fell since the
+            start.
         progress: called with the fit so far.
 
     Returns:
@@ -104,9 +113,12 @@ def fit(
 
     Raises:
         ValueError: nothing to tune or nothing to tune on, a start that cannot be judged (`Objective.check`), a
-            minibatch without a key or larger than the batch.
+            minibatch without a key or larger than the batch, no epochs or steps.
     """
     runs = len(batch.counted)
+    for name, number in (("epochs", epochs), ("steps", steps), ("patience", patience)):
+        if number < 1:
+            raise ValueError(f"{name}: expected at least 1, got {number}")
     if minibatch is not None and (key is None or not 1 <= minibatch <= runs):
         raise ValueError(f"minibatch: expected a key and 1 to {runs} sequences, got key {key} and {minibatch}")
     at = coordinates_objective(objective, params, tuned)
@@ -134,8 +146,7 @@ def fit(
         else:
             loss, gradient = jax.value_and_grad(value)(theta)
         norm = optax.tree.norm(gradient)
-        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of different widths
-            updates, after = optimiser.update(gradient, state, theta, value=loss, grad=gradient, value_fn=value)
+        updates, after = optimiser.update(gradient, state, theta, value=loss, grad=gradient, value_fn=value)
         moved = optax.apply_updates(theta, updates)
         fine = jnp.isfinite(loss) & jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(moved))
         kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), (moved, after), (theta, state))
@@ -146,19 +157,18 @@ def fit(
     def epoch(carry: Any, keys: Any, batch: Batch) -> Any:
         return jax.lax.scan(functools.partial(step, batch), carry, keys)
 
-    @jax.jit
-    def judged(theta: Coordinates, judge: Batch) -> jax.Array:
-        return at(theta, judge)[0]
+    def judged(theta: Coordinates) -> float:
+        return objective.judged(constrain(whole | theta), judge)[0]
 
     keys = jax.random.split(key, (epochs, steps)) if key is not None else np.zeros((epochs, steps))
     carry = _strong((theta, optimiser.init(theta)))
     began = time.perf_counter()
-    epoch = epoch.lower(carry, keys[0], batch).compile()
-    judged = judged.lower(carry[0], judge).compile()
-    compiled = time.perf_counter()
-    best, best_loss, best_epoch = carry[0], float(judged(carry[0], judge)), 0
+    best, best_loss, best_epoch = carry[0], judged(carry[0]), 0
     if not math.isfinite(best_loss):
         raise ValueError(f"validation: expected a finite loss at the start, got {best_loss}")
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of different widths
+        program = epoch.lower(carry, keys[0], batch).compile()
+    compiled = time.perf_counter()
     losses, traces, stale = [best_loss], [], 0
 
     def so_far() -> Fit:
@@ -167,10 +177,10 @@ def fit(
         return Fit(constrain(whole | best), best_loss, np.array(losses), trace, best_epoch, stale >= patience, *seconds)
 
     for number in range(epochs):
-        carry, trace = epoch(carry, keys[number], batch)
+        carry, trace = program(carry, keys[number], batch)
         traces.append(jax.tree.map(np.asarray, trace))
-        losses.append(float(judged(carry[0], judge)))
-        stale = 0 if losses[-1] < best_loss - tolerance else stale + 1
+        losses.append(judged(carry[0]))
+        stale = 0 if losses[-1] < best_loss - tolerance * (losses[0] - best_loss) else stale + 1
         if losses[-1] < best_loss:
             best, best_loss, best_epoch = carry[0], losses[-1], number + 1
         if progress is not None:

@@ -1,10 +1,10 @@
 """What a filter can be tuned for. Each loss is a pure function of parameters and a batch; an `Objective` is a
 weighted sum of them over one run of the filter.
 
-An observation that the gate refuses moves nothing, but it is judged all the same: it pays in `innovation` what an
-outlier pays and in `nis` for its distance, so that refusing is no way to win; and what is paid grows ever more slowly
-with the distance, so that one false reading does not outweigh a thousand good ones. Both are smooth across the gate,
-so the gradient has no part that a comparison hides.
+An observation that the gate refuses is judged all the same: it pays in `innovation` what an outlier pays and in `nis`
+for its distance, so that refusing is no way to win; and what is paid grows ever more slowly with the distance, so that
+one false reading does not outweigh a thousand good ones. What it pays is smooth across the gate. What its decision does
+to the steps that follow is not, and no derivative sees it: tune with a gate that weighs (`Config.gate_softness`).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from jaxlocmap import checks, consistency
+from jaxlocmap import consistency
 from jaxlocmap.foresight import foresee
 from jaxlocmap.linalg import Matrix, ldl
-from jaxlocmap.pipeline import init, run
 from jaxlocmap.tuning.batch import Batch
+from jaxlocmap.tuning.filtering import Judged, check_shapes, filtered
 from jaxlocmap.tuning.forward import forward
-from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params
+from jaxlocmap.types import Config, Info, Params
 
 OUTLIER_SHARE = 0.01  # of observations, what `innovation` allows for
 LEVER = 1.0  # m: a heading error of 1 rad counts in `state` as a position error of this
@@ -52,9 +52,9 @@ def innovation(params: Params, batch: Batch, *, config: Config) -> jax.Array:
 
         -log[ (1 - e) N(r; 0, S) + e / (2 pi max_range) ],   e = 0.01
 
-    The second term is the density of a false reading, anywhere in reach. It is what a refused observation comes to,
-    and for the good ones it makes no difference. Where errors are correlated in time this loss does not see it: the
-    innovations look right while the pose is over-confident. Then tune with truth.
+    The second term is the density of a false reading, anywhere within `config.max_range`. It is what a refused
+    observation comes to, and for the good ones it makes no difference. Where errors are correlated in time this loss
+    does not see it: the innovations look right while the pose is over-confident. Then tune with truth.
 
     Args:
         params: the filter's. batch: with observations. config: the filter's.
@@ -230,6 +230,11 @@ class Objective:
         terms = {name: LOSSES[name].value(sums[name]) for name in self.names}
         return jnp.asarray(sum(weight * terms[name] for name, weight in self.weights)), terms
 
+    def judged(self, params: Params, batch: Batch) -> tuple[float, dict[str, float]]:
+        """What a call returns, as numbers: compiled once for every shape of the batch."""
+        total, terms = self.value(jax.tree.map(jnp.sum, _tallied(self, params, batch)[0]))
+        return float(total), {name: float(term) for name, term in terms.items()}
+
     def check(self, params: Params, batch: Batch) -> None:
         """Raise if there is nothing to tune on, or if the start cannot be judged.
 
@@ -237,20 +242,21 @@ class Objective:
             ValueError: a loss whose observations, truth or scans are not there; a filter that refuses everything at
                 `params`; a loss that is not finite there, with the number of sequences at fault.
         """
-        _check_shapes(batch)
+        check_shapes(batch)
         observed = np.asarray(batch.inputs.valid) & np.asarray(batch.counted)[..., None]
         for name in self.names:
             needs = LOSSES[name].needs
-            if needs == "truth" and (batch.truth is None or batch.known is None):
+            if needs == "truth" and batch.truth is None:
                 raise ValueError(f"batch.truth: expected the true poses, which the loss `{name}` needs, got None")
-            if needs == "truth" and not np.any(np.asarray(batch.known) & np.asarray(batch.counted)):
+            known = True if batch.known is None else np.asarray(batch.known)
+            if needs == "truth" and not np.any(known & np.asarray(batch.counted)):
                 raise ValueError(f"batch.truth: expected a step with a known pose for the loss `{name}`, got none")
             if needs == "observations" and not observed.any():
                 raise ValueError(f"batch.inputs.valid: expected an observation for the loss `{name}`, got none")
             if needs == "scans" and (batch.inputs.ranges is None or batch.beam_angles is None):
                 raise ValueError(f"batch.inputs.ranges: expected scans, which the loss `{name}` needs, got None")
-        sums, accepted = _at_start(params, batch, config=self.config, names=self.names)
-        if accepted is not None and observed.any() and not int(accepted):
+        sums, accepted = _tallied(self, params, batch)
+        if accepted is not None and observed.any() and not np.any(np.asarray(accepted)):
             raise ValueError(
                 f"config.gate_probability: at the start the gate refuses all {int(observed.sum())} observations, so "
                 "nothing corrects the pose: expected a start with wider Q or R, or no gate (None)"
@@ -267,7 +273,21 @@ class Objective:
 def tallies(
     params: Params, batch: Batch, *, config: Config, names: tuple[str, ...]
 ) -> dict[str, tuple[jax.Array, ...]]:
-    """What every sequence adds to every loss: (N,) each. `LOSSES[name].value` makes a loss of their sums."""
+    """What every sequence adds to every loss of these names, (N,) each; `LOSSES[name].value` makes a loss of their
+    sums. Arguments as of a loss.
+    """
+    return _tallies(params, batch, config, names)[0]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _tallied(objective: Objective, params: Params, batch: Batch) -> tuple[dict[str, Any], jax.Array | None]:
+    return _tallies(params, batch, objective.config, objective.names)
+
+
+def _tallies(
+    params: Params, batch: Batch, config: Config, names: tuple[str, ...]
+) -> tuple[dict[str, tuple[jax.Array, ...]], jax.Array | None]:
+    """The tallies, and how many observations of each sequence the gate lets in, if the filter is run at all."""
     density = 1 / (2 * math.pi * config.max_range)
     of_filter = tuple(name for name in names if name != "map")
 
@@ -278,72 +298,21 @@ def tallies(
             if LOSSES[name].needs == "truth" and aside.known is not None:
                 judged = judged & aside.known
             sums[name] = tuple(jnp.where(judged, x, 0) for x in LOSSES[name].tally(_Step(info, aside.truth, density)))
-        return sums, info.belief.mean if "map" in names and batch.poses is None else ()
+        means = info.belief.mean if "map" in names and batch.poses is None else ()
+        return sums, jnp.sum(info.accepted & aside.counted), means
 
-    poses = batch.poses
+    poses, accepted = batch.poses, None
     sums: dict[str, Any] = {}
     if of_filter or poses is None:
-        per_step, means = filtered(params, batch, config=config, collect=collect)
+        per_step, let_in, means = filtered(params, batch, config=config, collect=collect)
         sums = {name: tuple(jnp.sum(x, axis=1) for x in columns) for name, columns in per_step.items()}
-        poses = means if poses is None else poses
+        poses, accepted = means if poses is None else poses, jnp.sum(let_in, axis=1)
     if "map" in names:
         # Reverse mode would keep a map of every step; the map has two parameters, so two more maps will do.
         sums["map"] = forward(functools.partial(_foreseen, config=config))(
             (jnp.asarray(params.l_occ), jnp.asarray(params.l_free)), (batch, jax.lax.stop_gradient(poses))
         )
-    return sums
-
-
-class Judged(NamedTuple):
-    """What is known of a step beside what the filter reports."""
-
-    counted: jax.Array  # () bool
-    truth: jax.Array | None  # (3,)
-    known: jax.Array | None  # () bool
-
-
-def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[[Info, Judged], Any]) -> Any:
-    """The filter over every sequence, without mapping: what `collect` made of each step, leading axes (N, T).
-
-    Raises:
-        ValueError, TypeError: as `pipeline.run`; fields of the batch that do not fit.
-    """
-    _check_shapes(batch)
-    config = dataclasses.replace(config, grid=None)
-    dtype = jnp.asarray(batch.prior.mean).dtype
-    params, landmarks, truth = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, batch.landmarks, batch.truth))
-
-    def one(prior: Gaussian, inputs: Inputs, judged: Judged) -> Any:
-        state = init(prior, config=config)
-        return run(
-            params,
-            state,
-            inputs,
-            landmarks=landmarks,
-            config=config,
-            collect=lambda state, info, aside: collect(info, aside),
-            aside=judged,
-        )[1]
-
-    judged = Judged(jnp.asarray(batch.counted), truth, batch.known)
-    return jax.vmap(one)(batch.prior, batch.inputs._replace(ranges=None), judged)
-
-
-def beliefs(params: Params, batch: Batch, *, config: Config) -> Gaussian:
-    """The filter's belief after every step, (N, T, 3) and (N, T, 3, 3)."""
-    return filtered(params, batch, config=config, collect=lambda info, _: info.belief)
-
-
-@functools.partial(jax.jit, static_argnames=("config", "names"))
-def _at_start(params: Params, batch: Batch, *, config: Config, names: tuple[str, ...]) -> tuple[Any, Any]:
-    """The tallies, and how many observations the gate lets in, if the filter is asked at all."""
-    sums = tallies(params, batch, config=config, names=names)
-    if batch.poses is not None and names == ("map",):
-        return sums, None
-    let_in = filtered(
-        params, batch, config=config, collect=lambda info, judged: jnp.sum(info.accepted & judged.counted)
-    )
-    return sums, jnp.sum(let_in)
+    return sums, accepted
 
 
 def _foreseen(amounts: tuple[jax.Array, jax.Array], data: tuple[Batch, jax.Array], *, config: Config) -> Any:
@@ -370,19 +339,3 @@ def _foreseen(amounts: tuple[jax.Array, jax.Array], data: tuple[Batch, jax.Array
 
 def _alone(name: str, params: Params, batch: Batch, config: Config) -> jax.Array:
     return Objective(config, ((name, 1.0),))(params, batch)[0]
-
-
-def _check_shapes(batch: Batch) -> None:
-    """Raise if the fields of a batch do not fit.
-
-    Raises:
-        ValueError: a wrong shape. TypeError: a field that is no array.
-    """
-    checks.shape("batch.counted", batch.counted, (None, None))
-    n, steps = np.shape(batch.counted)
-    checks.shape("batch.prior.mean", batch.prior.mean, (n, 3))
-    checks.shape("batch.prior.cov", batch.prior.cov, (n, 3, 3))
-    checks.shape("batch.inputs.dt", batch.inputs.dt, (n, steps))
-    for name, shape in (("truth", (n, steps, 3)), ("known", (n, steps)), ("poses", (n, steps, 3))):
-        if getattr(batch, name) is not None:
-            checks.shape(f"batch.{name}", getattr(batch, name), shape)

@@ -16,7 +16,7 @@ NAMES = ("v", "w", "v_w", "range", "bearing", "range_bearing", "l_occ", "l_free"
 NOISE = ("v", "w", "range", "bearing")  # with Q and R diagonal
 FULL_NOISE = ("v", "w", "v_w", "range", "bearing", "range_bearing")
 SENSOR_MODEL = ("l_occ", "l_free")
-UNITS = dict(zip(NAMES, ("m/s", "rad/s", "–", "m", "rad", "–", "nats", "nats"), strict=True))
+UNITS: dict[str, str] = dict(zip(NAMES, ("m/s", "rad/s", "–", "m", "rad", "–", "nats", "nats"), strict=True))
 
 _DEVIATION = math.log(1e5)  # standard deviations and log-odds lie between 1e-5 and 1e5 of their units,
 _TILT = 10.0  # and correlations within ±0.995: beyond, float32 cannot hold the matrix apart from a singular one
@@ -43,6 +43,12 @@ def constrain(coordinates: Coordinates) -> Params:
 
     Far out the coordinates have limits (1e-5 to 1e5 in the units of each; correlations to ±0.995), at which the
     derivative is zero.
+
+    Args:
+        coordinates: all eight of `NAMES`, () each.
+
+    Returns:
+        `Params` that `Params.check` accepts.
     """
     return Params(
         Q=_covariance(coordinates, "v", "w"),

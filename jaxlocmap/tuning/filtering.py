@@ -1,0 +1,80 @@
+"""The filter over a batch of sequences."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxlocmap import checks
+from jaxlocmap.pipeline import init, run
+from jaxlocmap.tuning.batch import Batch
+from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params
+
+
+class Judged(NamedTuple):
+    """What is known of a step beside what the filter reports."""
+
+    counted: jax.Array  # () bool
+    truth: jax.Array | None  # (3,) m, m, rad
+    known: jax.Array | None  # () bool
+
+
+def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[[Info, Judged], Any]) -> Any:
+    """The filter over every sequence, without mapping.
+
+    Args:
+        params: the filter's. batch: N sequences of T steps. config: static; its grid is left aside.
+        collect: `(info, judged) -> pytree`, what to keep of each step.
+
+    Returns:
+        What `collect` made of each step, leading axes (N, T).
+
+    Raises:
+        ValueError, TypeError: as `pipeline.run`; fields of the batch that do not fit.
+    """
+    check_shapes(batch)
+    config = dataclasses.replace(config, grid=None)
+    dtype = jnp.asarray(batch.prior.mean).dtype
+    params, landmarks, truth = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, batch.landmarks, batch.truth))
+
+    def one(prior: Gaussian, inputs: Inputs, judged: Judged) -> Any:
+        state = init(prior, config=config)
+        _, collected = run(
+            params,
+            state,
+            inputs,
+            landmarks=landmarks,
+            config=config,
+            collect=lambda state, info, aside: collect(info, aside),
+            aside=judged,
+        )
+        return collected
+
+    judged = Judged(jnp.asarray(batch.counted), truth, batch.known)
+    return jax.vmap(one)(batch.prior, batch.inputs._replace(ranges=None), judged)
+
+
+def beliefs(params: Params, batch: Batch, *, config: Config) -> Gaussian:
+    """The filter's belief after every step, (N, T, 3) m, m, rad and (N, T, 3, 3). The rest as of `filtered`."""
+    return filtered(params, batch, config=config, collect=lambda info, _: info.belief)
+
+
+def check_shapes(batch: Batch) -> None:
+    """Raise if the fields of a batch do not fit.
+
+    Raises:
+        ValueError: a wrong shape. TypeError: a field that is no array.
+    """
+    checks.shape("batch.counted", batch.counted, (None, None))
+    n, steps = np.shape(batch.counted)
+    checks.shape("batch.prior.mean", batch.prior.mean, (n, 3))
+    checks.shape("batch.prior.cov", batch.prior.cov, (n, 3, 3))
+    checks.shape("batch.inputs.dt", batch.inputs.dt, (n, steps))
+    for name, shape in (("truth", (n, steps, 3)), ("known", (n, steps)), ("poses", (n, steps, 3))):
+        if getattr(batch, name) is not None:
+            checks.shape(f"batch.{name}", getattr(batch, name), shape)
