@@ -289,18 +289,22 @@ _SHOWN = (
     ("nis_mean", "NIS (2)"),
     ("coverage_95", "95 % ellipsoid holds"),
     ("gate_accept_rate", "gate lets in"),
-    ("rmse_position_m", "position RMSE [m]"),
-    ("rmse_yaw_rad", "yaw RMSE [rad]"),
-    ("log_loss", "log-loss one scan ahead [nats]"),
-    ("calibration_error", "calibration error one scan ahead"),
+    ("rmse_position_m", "position RMSE, m"),
+    ("rmse_yaw_rad", "yaw RMSE, rad"),
+    ("log_loss", "log-loss, nats"),
+    ("brier", "Brier score"),
+    ("calibration_error", "calibration error"),
 )
+
+
+_GROUPS = {"map": "final map against the walls", "one_scan_ahead": "map, one scan ahead"}
 
 
 def _print(report: dict[str, Any]) -> None:
     table = Table("parameter", "start", "end", "standard error", title=report["source"], title_justify="left")
     for name, value in report["parameters"].items():
         error = value["standard_error"]
-        table.add_row(f"{name} [{value['unit']}]", f"{value['start']:.4g}", f"{value['end']:.4g}", f"{error:.2g}")
+        table.add_row(f"{name}, {value['unit']}", f"{value['start']:.4g}", f"{value['end']:.4g}", f"{error:.2g}")
     CONSOLE.print(table)
     table = Table("held out", "quantity", "before", "after")
     before, after = report["held_out"]["before"], report["held_out"]["after"]
@@ -309,7 +313,7 @@ def _print(report: dict[str, Any]) -> None:
     for group, (old, new) in groups.items():
         for key, words in _SHOWN:
             if new.get(key) is not None and old.get(key) is not None:
-                table.add_row(group.replace("_", " "), words, readable(old[key], 4), readable(new[key], 4))
+                table.add_row(_GROUPS.get(group, group), words, readable(old[key], 4), readable(new[key], 4))
     CONSOLE.print(table)
     for name, rows in report["loss"].items():
         pairs = [
@@ -319,7 +323,7 @@ def _print(report: dict[str, Any]) -> None:
         ]
         CONSOLE.print(f"loss {name}, {_LOSS_WORDS[name]}: {'; '.join(pairs)}", highlight=False)
     for sentence in report["not_identified"]:
-        CONSOLE.print(f"not identified: {sentence}", highlight=False)
+        CONSOLE.print(f"careful: {sentence}", highlight=False)
     CONSOLE.print(
         f"{report['evaluations']} evaluations in {report['run_s']:.1f} s after {report['compile_s']:.1f} s of "
         f"compilation; {report['skipped_steps']} steps skipped as not finite",
