@@ -137,7 +137,7 @@ def update(
     reported = corrected = _correct(P, H, noise, r)
     nis = reported.nis
     accepted = applied = jnp.logical_and(nis < threshold, valid)  # what is no number is not below, gate or none
-    if softness:
+    if softness and not (isinstance(threshold, float) and math.isinf(threshold)):
         weight = jnp.maximum(jax.nn.sigmoid((threshold - nis) / softness), _LEAST_WEIGHT)
         corrected, applied = _correct(P, H, noise.scale(1 / weight), r), jnp.logical_and(jnp.isfinite(nis), valid)
     shift = corrected.shift
