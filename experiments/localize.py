@@ -75,13 +75,18 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
             dt=PERIOD, motion=config.motion, gate_probability=config.gate, sensor_offset=offset_of(log.sensor_offset)
         )
         start = first_pose(log, timeline) if config.start is None else np.array(config.start)
-        prior = Gaussian(jnp.asarray(start), jnp.diag(jnp.array(PRIOR_STD) ** 2))
+        prior = prior_at(start)
         CONSOLE.print(f"{len(timeline.time)} steps of {log.name}; compiling takes some seconds")
         info = filter_log(params, prior, timeline.inputs, log.landmarks, settings)
         report = judge(log, timeline, info, settings)
     report["params"] = {name: np.asarray(value).tolist() for name, value in params._asdict().items()}
     _write(out, log, timeline, info, report)
     return report
+
+
+def prior_at(pose: np.ndarray) -> Gaussian:
+    """What a filter believes that starts at a pose, m, m, rad."""
+    return Gaussian(jnp.asarray(pose), jnp.diag(jnp.array(PRIOR_STD) ** 2))
 
 
 def first_pose(log: Log, timeline: Timeline) -> np.ndarray:

@@ -100,17 +100,16 @@ def main(config: TuneConfig) -> dict[str, Any]:
         tuned = _tuned(config, losses)
         CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds", highlight=False)
         found = _fit(config, objective, source, tuned, out)
-        write_report(out, {"source": source.name, "losses": dict(weights), **_descent(config, found)})
+        descent = {"source": source.name, "losses": dict(weights), **_descent(config, losses, found)}
+        write_report(out, descent)
         CONSOLE.print("judging what was held out, before and after; standard errors", highlight=False)
         sure = tuning.certainty(objective, found.params, source.compared, tuned)
         report = {
-            "source": source.name,
-            "losses": dict(weights),
+            **descent,
             "parameters": _parameters(source.start, found.params, sure),
             "correlation": dict(names=list(sure.names), matrix=sure.correlation.tolist()),
             "not_identified": list(sure.words),
             "loss": _losses(objective, source, found.params),
-            **_descent(config, found),
         }
         before, after = source.evidence(source.start), source.evidence(found.params)
     files = _figures(out, source, report, before, after)
@@ -225,10 +224,10 @@ def _losses(objective: tuning.Objective, source: Source, end: Params) -> dict[st
     return rows
 
 
-def _descent(config: TuneConfig, found: tuning.Fit) -> dict[str, Any]:
+def _descent(config: TuneConfig, losses: tuple[str, ...], found: tuning.Fit) -> dict[str, Any]:
     trace = found.trace
     return {
-        "loss_words": "; ".join(_LOSS_WORDS[name] for name, _ in _weights(config.loss)),
+        "loss_words": "; ".join(_LOSS_WORDS[name] for name in losses),
         "evaluations": int(trace.evaluations.sum()),
         "skipped_steps": int(trace.skipped.sum()),
         "stopped_early": found.stopped_early,

@@ -299,13 +299,9 @@ def _linear_drives(rng: np.random.Generator, count: int, steps: int) -> tuning.B
 
 def _linear_sequence(truth: np.ndarray, z: np.ndarray) -> tuning.Batch:
     steps = len(truth)
-    inputs = Inputs(
-        dt=np.full(steps, _DT),  # type: ignore[arg-type]
-        control=np.zeros((steps, 2)),  # type: ignore[arg-type]
-        landmark=np.zeros((steps, 1), np.int32),  # type: ignore[arg-type]
-        z=z[:, None],  # type: ignore[arg-type]
-        valid=np.ones((steps, 1), bool),  # type: ignore[arg-type]
-    )
+    seen: Any = (np.zeros((steps, 1), np.int32), z[:, None], np.ones((steps, 1), bool))
+    still: Any = (np.full(steps, _DT), np.zeros((steps, 2)))
+    inputs = Inputs(*still, *seen)
     prior = Gaussian(jnp.zeros(3), jnp.diag(jnp.array([1e-2, 1e-4, 1e-4])))
     return tuning.sequence(inputs, prior, landmarks=np.array([[_FAR, 0.0]]), truth=truth)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from common import scenario_of
-from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of
+from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of, prior_at
 from map_log import MapLogConfig, extent, first_scans
 
 from jaxlocmap import Config, Gaussian, Params, simulate, tuning
-from jaxlocmap.foresight import Foresight, foresee
+from jaxlocmap.foresight import Foresight
 from jaxlocmap.logs import Log, Timeline, read, to_timeline
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.study import Study, summarise
@@ -183,7 +184,7 @@ def _tuning(config: Config) -> Config:
 
 def _scans(log: Log, count: int) -> tuning.Batch:
     inputs = tuning.no_observations(count)._replace(ranges=log.scan[:count])
-    prior = _prior(log.truth[0])
+    prior = prior_at(log.truth[0])
     return tuning.sequence(inputs, prior, beam_angles=log.beam_angles, poses=log.truth[:count])
 
 
@@ -206,15 +207,11 @@ def _from_truth(timeline: Timeline) -> Timeline:
     return _cut(timeline, int(np.argmax(timeline.truth_valid)), None)
 
 
-def _prior(pose: np.ndarray) -> Gaussian:
-    return Gaussian(jnp.asarray(pose), jnp.diag(jnp.array(PRIOR_STD) ** 2))
-
-
 def _windows(timeline: Timeline, log: Log, start: Params, config: Config, length: int, run_in: int) -> tuning.Batch:
     """Windows that start at the truth where it is known, and elsewhere roughly where the filter believes to be."""
     whole = tuning.sequence(
         timeline.inputs,
-        _prior(first_pose(log, timeline)),
+        prior_at(first_pose(log, timeline)),
         landmarks=log.landmarks,
         truth=timeline.truth,
         known=timeline.truth_valid,
@@ -229,38 +226,22 @@ def _windows(timeline: Timeline, log: Log, start: Params, config: Config, length
 
 
 def _judged(params: Params, log: Log, timeline: Timeline, config: Config) -> Evidence:
-    info = filter_log(params, _prior(first_pose(log, timeline)), timeline.inputs, log.landmarks, config)
+    info = filter_log(params, prior_at(first_pose(log, timeline)), timeline.inputs, log.landmarks, config)
     report = judge(log, timeline, info, config)
     return report | {"time": timeline.time}
 
 
+@functools.partial(jax.jit, static_argnames="config")
+def _foreseen(params: Params, batch: tuning.Batch, *, config: Config) -> Foresight:
+    """The sums over all drives, mapped where the batch says or else where the filter is."""
+    poses = batch.poses if batch.poses is not None else tuning.beliefs(params, batch, config=config).mean
+    each = tuning.foreseen(params.l_occ, params.l_free, batch, poses, config=config, bins=True)
+    return jax.tree.map(lambda x: jnp.sum(x, axis=0), each)
+
+
 def _foresight(params: Params, batch: tuning.Batch, config: Config) -> Evidence:
     """Log-loss and calibration one scan ahead."""
-    spec = config.grid
-    poses = batch.poses if batch.poses is not None else tuning.beliefs(params, batch, config=config).mean
-    if spec is None or batch.inputs.ranges is None:
-        raise ValueError("map: expected a grid and scans, got None")
-
-    @jax.jit
-    def total(params: Params, poses: jax.Array, ranges: jax.Array, counted: jax.Array, angles: jax.Array) -> Foresight:
-        def one(poses: jax.Array, ranges: jax.Array, counted: jax.Array) -> Foresight:
-            return foresee(
-                params.l_occ,
-                params.l_free,
-                poses,
-                ranges,
-                counted,
-                angles,
-                spec=spec,
-                min_range=config.min_range,
-                max_range=config.max_range,
-                bins=True,
-            )
-
-        return jax.tree.map(lambda x: jnp.sum(x, axis=0), jax.vmap(one)(poses, ranges, counted))
-
-    arrays = (jnp.asarray(x) for x in (poses, batch.inputs.ranges, batch.counted, batch.beam_angles))
-    sums = jax.tree.map(lambda x: np.asarray(x, np.float64), total(params, *arrays))
+    sums = jax.tree.map(lambda x: np.asarray(x, np.float64), _foreseen(params, batch, config=config))
     some = np.maximum(sums.bin_cells, 1)
     return {
         "log_loss": float(sums.log_loss / sums.cells),

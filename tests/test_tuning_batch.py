@@ -7,14 +7,13 @@ import pytest
 from drives import ONLY_POSES, OWN, drives
 
 from jaxlocmap import Gaussian, tuning
-from jaxlocmap.tuning.losses import tallies
 
-LOSSES = ("innovation", "pose")
+OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation", 1.0), ("pose", 1.0)))
 
 
 @jax.jit
 def every_sum(batch):
-    return tallies(OWN, batch, config=ONLY_POSES, names=LOSSES)
+    return OBJECTIVE.tallies(OWN, batch)
 
 
 def near(got, expected, tolerance):

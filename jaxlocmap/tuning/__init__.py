@@ -13,7 +13,7 @@ from jaxlocmap.tuning.batch import Batch, blocks, join, no_observations, pick, s
 from jaxlocmap.tuning.certainty import Certainty, certainty
 from jaxlocmap.tuning.filtering import beliefs
 from jaxlocmap.tuning.fit import Fit, coordinates_objective, fit
-from jaxlocmap.tuning.losses import LOSSES, Objective
+from jaxlocmap.tuning.losses import LOSSES, Objective, foreseen
 from jaxlocmap.tuning.parameters import FULL_NOISE, NAMES, NOISE, SENSOR_MODEL, UNITS, constrain, natural, unconstrain
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "constrain",
     "coordinates_objective",
     "fit",
+    "foreseen",
     "join",
     "natural",
     "no_observations",

@@ -62,8 +62,14 @@ def sequence(
 
 def no_observations(steps: int) -> Inputs:
     """Inputs (T,) of a robot that stands still and sees nothing, to fill in what it did measure; no slots."""
-    arrays: Any = (np.zeros(steps), np.zeros((steps, 2)), np.zeros((steps, 0), np.int32), np.zeros((steps, 0, 2)))
-    return Inputs(*arrays, valid=np.asarray(arrays[2], bool))  # type: ignore[arg-type]
+    arrays: Any = (
+        np.zeros(steps),
+        np.zeros((steps, 2)),
+        np.zeros((steps, 0), np.int32),
+        np.zeros((steps, 0, 2)),
+        np.zeros((steps, 0), bool),
+    )
+    return Inputs(*arrays)
 
 
 def join(*batches: Batch) -> Batch:
@@ -87,9 +93,7 @@ def join(*batches: Batch) -> Batch:
     steps = max(b.counted.shape[1] for b in batches)
     slots = max(b.inputs.valid.shape[2] for b in batches)
     parts = [_apart_from_shared(_filled(b, steps, slots)) for b in batches]
-    return jax.tree.map(lambda *xs: np.concatenate(xs), *parts)._replace(
-        **{name: getattr(batches[0], name) for name in _SHARED}
-    )
+    return _shared_with(batches[0], jax.tree.map(lambda *xs: np.concatenate(xs), *parts))
 
 
 def windows(batch: Batch, length: int, *, run_in: int, beliefs: Gaussian) -> Batch:
@@ -123,7 +127,7 @@ def windows(batch: Batch, length: int, *, run_in: int, beliefs: Gaussian) -> Bat
             if first:
                 start = Gaussian(means[n, first - 1], covs[n, first - 1])
             piece = piece._replace(prior=jax.tree.map(lambda x: x[None], start), counted=counted)
-            parts.append(piece._replace(**{name: getattr(batch, name) for name in _SHARED}))
+            parts.append(_shared_with(batch, piece))
     return join(*parts)
 
 
@@ -141,13 +145,12 @@ def blocks(batch: Batch, count: int) -> Batch:
     shares = np.zeros(copies.counted.shape, bool)
     for row, steps in zip(shares, np.array_split(counted, count), strict=True):
         row[steps] = True
-    return copies._replace(counted=shares, **{name: getattr(batch, name) for name in _SHARED})
+    return _shared_with(batch, copies._replace(counted=shares))
 
 
 def pick(batch: Batch, rows: Any) -> Batch:
     """The sequences in these rows: an array, a mask or a slice. Also under jit, with an array of rows."""
-    some = jax.tree.map(lambda x: x[rows], _apart_from_shared(batch))
-    return some._replace(**{name: getattr(batch, name) for name in _SHARED})
+    return _shared_with(batch, jax.tree.map(lambda x: x[rows], _apart_from_shared(batch)))
 
 
 def simulated(
@@ -202,6 +205,11 @@ def _drives(
 
 def _apart_from_shared(batch: Batch) -> Batch:
     return batch._replace(**dict.fromkeys(_SHARED))
+
+
+def _shared_with(batch: Batch, sequences: Batch) -> Batch:
+    """These sequences with what those of the batch share."""
+    return sequences._replace(**{name: getattr(batch, name) for name in _SHARED})
 
 
 def _same(a: Any, b: Any) -> bool:

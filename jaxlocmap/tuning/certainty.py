@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.tuning.losses import Objective
-from jaxlocmap.tuning.parameters import NAMES, constrain, natural, unconstrain
+from jaxlocmap.tuning.parameters import check_names, constrain, natural, unconstrain
 from jaxlocmap.types import Params
 
 _VAGUE = 1.0  # a standard error of a coordinate above this is said in words
@@ -53,8 +53,7 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
     n = len(batch.counted)
     if n < 2:
         raise ValueError(f"batch: expected at least two sequences to compare, got {n}; cut long ones into windows")
-    if not tuned or any(name not in NAMES for name in tuned):
-        raise ValueError(f"tuned: expected some of {NAMES}, got {tuned}")
+    check_names(tuned)
     whole = unconstrain(params)
     theta = jnp.stack([whole[name] for name in tuned]).astype(jnp.asarray(batch.prior.mean).dtype)
 

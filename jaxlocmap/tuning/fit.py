@@ -16,7 +16,7 @@ import optax
 from jaxlocmap.tuning.batch import Batch, pick
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.losses import Objective
-from jaxlocmap.tuning.parameters import NAMES, NOISE, Coordinates, constrain, natural, unconstrain
+from jaxlocmap.tuning.parameters import NOISE, Coordinates, check_names, constrain, natural, unconstrain
 from jaxlocmap.types import Params
 
 
@@ -59,8 +59,7 @@ def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str
     Raises:
         ValueError: nothing to tune, a name that is none of `NAMES`, or parameters beyond the limits of `constrain`.
     """
-    if not tuned or any(name not in NAMES for name in tuned):
-        raise ValueError(f"tuned: expected some of {NAMES}, got {tuned}")
+    check_names(tuned)
     params.check()
     inside = natural(constrain(unconstrain(params)))
     for name, value in natural(params).items():

@@ -21,7 +21,7 @@ import numpy as np
 import scipy.special
 
 from jaxlocmap import consistency
-from jaxlocmap.foresight import foresee
+from jaxlocmap.foresight import Foresight, foresee
 from jaxlocmap.linalg import Matrix, ldl
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.tuning.filtering import Judged, check_shapes, filtered
@@ -223,7 +223,7 @@ class Objective:
 
     def tallies(self, params: Params, batch: Batch) -> dict[str, tuple[jax.Array, ...]]:
         """What every sequence adds to every loss, (N,) each."""
-        return tallies(params, batch, config=self.config, names=self.names)
+        return _tallies(params, batch, self.config, self.names)[0]
 
     def value(self, sums: dict[str, tuple[jax.Array, ...]]) -> tuple[jax.Array, dict[str, jax.Array]]:
         """What a call returns, of the tallies' sums over sequences."""
@@ -270,15 +270,6 @@ class Objective:
                 )
 
 
-def tallies(
-    params: Params, batch: Batch, *, config: Config, names: tuple[str, ...]
-) -> dict[str, tuple[jax.Array, ...]]:
-    """What every sequence adds to every loss of these names, (N,) each; `LOSSES[name].value` makes a loss of their
-    sums. Arguments as of a loss.
-    """
-    return _tallies(params, batch, config, names)[0]
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def _tallied(objective: Objective, params: Params, batch: Batch) -> tuple[dict[str, Any], jax.Array | None]:
     return _tallies(params, batch, objective.config, objective.names)
@@ -309,21 +300,35 @@ def _tallies(
         poses, accepted = means if poses is None else poses, jnp.sum(let_in, axis=1)
     if "map" in names:
         # Reverse mode would keep a map of every step; the map has two parameters, so two more maps will do.
-        sums["map"] = forward(functools.partial(_foreseen, config=config))(
-            (jnp.asarray(params.l_occ), jnp.asarray(params.l_free)), (batch, jax.lax.stop_gradient(poses))
-        )
+        amounts, data = (jnp.asarray(params.l_occ), jnp.asarray(params.l_free)), (batch, jax.lax.stop_gradient(poses))
+        total = forward(lambda amounts, data: foreseen(*amounts, *data, config=config))(amounts, data)
+        sums["map"] = total.log_loss, total.cells
     return sums, accepted
 
 
-def _foreseen(amounts: tuple[jax.Array, jax.Array], data: tuple[Batch, jax.Array], *, config: Config) -> Any:
-    batch, poses = data
+def foreseen(
+    l_occ: jax.Array, l_free: jax.Array, batch: Batch, poses: jax.Array, *, config: Config, bins: bool = False
+) -> Foresight:
+    """`foresight.foresee` over every sequence.
+
+    Args:
+        l_occ, l_free: () nats, > 0 and < 0. batch: with scans. poses: (N, T, 3) m, m, rad, where to map them. config:
+            static, with a grid. bins: fill the bins too.
+
+    Returns:
+        `Foresight` with a leading axis N.
+
+    Raises:
+        ValueError: no grid, scans or beams; a wrong shape.
+    """
     spec = config.grid
     if spec is None or batch.inputs.ranges is None or batch.beam_angles is None:
         raise ValueError("loss `map`: expected config.grid, batch.inputs.ranges and batch.beam_angles, got None")
 
-    def one(poses: jax.Array, ranges: jax.Array, counted: jax.Array) -> tuple[jax.Array, jax.Array]:
-        total = foresee(
-            *amounts,
+    def one(poses: jax.Array, ranges: jax.Array, counted: jax.Array) -> Foresight:
+        return foresee(
+            l_occ,
+            l_free,
             poses,
             ranges,
             counted,
@@ -331,8 +336,8 @@ def _foreseen(amounts: tuple[jax.Array, jax.Array], data: tuple[Batch, jax.Array
             spec=spec,
             min_range=config.min_range,
             max_range=config.max_range,
+            bins=bins,
         )
-        return total.log_loss, total.cells
 
     return jax.vmap(one)(jnp.asarray(poses), batch.inputs.ranges, batch.counted)
 

@@ -22,6 +22,16 @@ _DEVIATION = math.log(1e5)  # standard deviations and log-odds lie between 1e-5 
 _TILT = 10.0  # and correlations within ±0.995: beyond, float32 cannot hold the matrix apart from a singular one
 
 
+def check_names(tuned: tuple[str, ...]) -> None:
+    """Raise unless these are some of `NAMES`.
+
+    Raises:
+        ValueError: none, or another name.
+    """
+    if not tuned or any(name not in NAMES for name in tuned):
+        raise ValueError(f"tuned: expected some of {NAMES}, got {tuned}")
+
+
 def unconstrain(params: Params) -> Coordinates:
     """The coordinates of parameters, all eight of `NAMES`. `constrain` is the way back.
 
