@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from pathlib import Path
 from typing import Any, Literal
 
@@ -137,87 +138,42 @@ def filter_log(params: Params, prior: Gaussian, inputs: Inputs, landmarks: np.nd
 
 
 def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str, Any]:
-    valid = timeline.inputs.valid
-    observations = int(valid.sum())
-    rate = float(info.accepted.sum()) / observations if observations else float("nan")
-    report: dict[str, Any] = {
+    """The report of the library's `judge`, and what a log adds to it."""
+    valid, truth = np.asarray(timeline.inputs.valid), timeline.truth_valid
+    report = consistency.judge(
+        timeline.truth,
+        np.asarray(info.belief.mean),
+        np.asarray(info.belief.cov),
+        time=timeline.time,
+        valid=truth,
+        innovations=consistency.Innovations(info.innovation, info.S, valid, info.accepted, info.row),
+        gate_probability=config.gate_probability,
+    )
+    nees = np.array(report["nees_per_step"])
+    at_sightings = nees[valid.any(axis=1) & np.isfinite(nees)]
+    if not truth.any():
+        report["verdict"] = "no verdict: the log has no truth to judge the covariance by"
+    return report | {
         "log": log.name,
-        "steps": len(timeline.time),
         "duration_s": float(timeline.time[-1] - timeline.time[0]),
-        "observations": observations,
-        "gate_accept_rate": rate,
-        "gate_nominal_rate": config.gate_probability,
-        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability, observations),
-        "longest_rejection": _longest_rejection(np.asarray(valid), np.asarray(info.accepted)),
-        "nis_mean": float(info.nis[valid].mean()) if observations else None,
-        "innovation_lag_one": _whiteness(log, timeline, info),
         "flagged_steps": int((~info.ok).sum()),
         "log_likelihood": float(info.log_likelihood.sum()),
         "counts": timeline.counts,
-        "truth_share": float(timeline.truth_valid.mean()),
+        "left_out": report["counts"],
+        "truth_share": float(truth.mean()),
+        "anees_at_sightings": float(at_sightings.mean()) if len(at_sightings) else math.nan,
     }
-    nees, error = score(timeline, info)
-    scored = nees[np.isfinite(nees)]
-    if not len(scored):
-        nothing = ("rmse_position_m", "rmse_yaw_rad", "anees", "anees_at_sightings", "nees_median")
-        levels = (f"coverage_{round(100 * level)}" for level in consistency.COVERAGE_LEVELS)
-        report |= dict.fromkeys((*nothing, *levels))
-        return report | {"verdict": "no truth: the covariance cannot be judged", "nees": nees}
-    at_sightings = nees[valid.any(axis=1) & np.isfinite(nees)]
-    return report | {
-        "rmse_position_m": float(np.sqrt(np.nanmean(np.sum(error[:, :2] ** 2, axis=1)))),
-        "rmse_yaw_rad": float(np.sqrt(np.nanmean(error[:, 2] ** 2))),
-        "anees": float(scored.mean()),
-        "anees_at_sightings": float(at_sightings.mean()) if len(at_sightings) else None,
-        "nees_median": float(np.median(scored)),
-        **{f"coverage_{round(100 * level)}": share for level, share in consistency.shares_below(scored).items()},
-        "verdict": consistency.verdict(float(scored.mean())),
-        "nees": nees,
-    }
-
-
-def score(timeline: Timeline, info: Info) -> tuple[np.ndarray, np.ndarray]:
-    """NEES (T,) and pose errors (T, 3), NaN where there is no truth."""
-    error = jax.vmap(consistency.pose_error)(jnp.asarray(timeline.truth), jnp.asarray(info.belief.mean))
-    nees = jax.vmap(consistency.nees)(error, jnp.asarray(info.belief.cov))
-    return np.asarray(nees), np.asarray(error)
-
-
-def _longest_rejection(valid: np.ndarray, accepted: np.ndarray) -> int:
-    """The longest streak of observations that the gate refused one after the other."""
-    refused = ~accepted[valid]
-    breaks = np.flatnonzero(~refused)
-    edges = np.concatenate([[-1], breaks, [len(refused)]])
-    return int(np.max(np.diff(edges)) - 1)
-
-
-def _whiteness(log: Log, timeline: Timeline, info: Info) -> dict[str, float | None]:
-    """Correlation of successive innovations of the same landmark, with its band."""
-    step, slot = np.nonzero(timeline.inputs.valid)
-    if not len(step):
-        return {"range": None, "bearing": None, "band_95": None}
-    white = jax.vmap(consistency.whiten)(jnp.asarray(info.innovation[step, slot]), jnp.asarray(info.S[step, slot]))
-    landmark = timeline.inputs.landmark[step, slot]
-    columns = np.zeros((len(timeline.time), len(log.landmarks), 2))
-    seen = np.zeros(columns.shape[:2], bool)
-    columns[step, landmark], seen[step, landmark] = white, True
-    products, squares, pairs = consistency.lag_one(jnp.asarray(columns), jnp.asarray(seen))
-    if not pairs:
-        return {"range": None, "bearing": None, "band_95": None}
-    correlation = products / squares
-    return {"range": float(correlation[0]), "bearing": float(correlation[1]), "band_95": 1.96 / float(pairs) ** 0.5}
 
 
 def _write(out: Path, log: Log, timeline: Timeline, info: Info, report: dict[str, Any]) -> None:
-    nees = report.pop("nees")
     write_report(out, report)
     write_tum(out / "estimate.tum", timeline.time, info.belief.mean)
     files = ["report.json", "trajectory.png", "estimate.tum"]
     known = timeline.truth_valid
-    judged = report["anees"] is not None
+    judged = report["scored_steps"] > 0
     if judged:
         write_tum(out / "truth.tum", timeline.time[known], timeline.truth[known])
-        plotting.log_nees_figure(out / "nees.png", timeline.time, nees, report)
+        plotting.judge_figure(out / "nees.png", report, timeline.truth[:, :2], log.name)
         files += ["truth.tum", "nees.png"]
     plotting.trajectory_figure(
         out / "trajectory.png",
@@ -232,27 +188,27 @@ def _write(out: Path, log: Log, timeline: Timeline, info: Info, report: dict[str
 
 
 def _print(report: dict[str, Any], judged: bool) -> None:
-    lag = report["innovation_lag_one"]
+    lag, lag_band = report["innovation_lag_one"], report["innovation_lag_one_band_95"]
     nominal = report["gate_nominal_rate"]
     rows = [
         ("steps, observations", f"{report['steps']}, {report['observations']}", ""),
         ("gate lets in", f"{100 * report['gate_accept_rate']:.1f} %", f"{100 * (nominal or 1):g} %"),
         ("longest streak refused", f"{report['longest_rejection']} observations", ""),
-        ("NIS (2 degrees)", "–" if report["nis_mean"] is None else f"{report['nis_mean']:.3f}", "2"),
+        ("NIS (2 degrees)", f"{report['nis_mean']:.3f}", "2"),
+        *((f"innovation lag one, {name}", f"{lag[name]:+.3f}", f"±{lag_band[name]:.3f}") for name in lag),
     ]
-    if lag["band_95"] is not None:
-        rows.append(("innovation lag one", f"{lag['range']:+.3f}, {lag['bearing']:+.3f}", f"±{lag['band_95']:.3f}"))
     if judged:
+        low, high = report["anees_band_95"]
         rows += [
             ("position RMSE", f"{report['rmse_position_m']:.3f} m", ""),
             ("yaw RMSE", f"{report['rmse_yaw_rad']:.3f} rad", ""),
-            ("ANEES (3 degrees)", consistency.readable(report["anees"]), "3"),
-            ("ANEES at sightings", consistency.readable(report["anees_at_sightings"] or float("nan")), "3"),
+            ("ANEES (3 degrees)", consistency.readable(report["anees"]), f"[{low:.3g}, {high:.3g}]"),
+            ("ANEES at sightings", consistency.readable(report["anees_at_sightings"]), "3"),
             ("median NEES", consistency.readable(report["nees_median"]), f"{consistency.chi2_quantile(0.5, 3):.2f}"),
             ("95 % ellipsoid holds", f"{100 * report['coverage_95']:.1f} %", "95 %"),
             ("steps with truth", f"{100 * report['truth_share']:.1f} %", ""),
         ]
-    show(report["log"], rows + count_rows(report["counts"]))
+    show(report["log"], rows + count_rows(report["counts"] | report["left_out"]))
     CONSOLE.print(f"[bold]{report['verdict']}[/bold]", highlight=False)
     CONSOLE.print(report["gate_verdict"], highlight=False)
 

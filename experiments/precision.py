@@ -158,13 +158,12 @@ def _beliefs(state: Any, info: Any, aside: Any) -> tuple[Gaussian, jax.Array]:
 def _score(truth: jax.Array, beliefs: Gaussian, ok: jax.Array) -> Score:
     """Judged in float64 whatever the filter's own type, so that the filters alone differ."""
     mean, cov = (x.astype(truth.dtype) for x in beliefs)
+    score = jax.vmap(consistency.score_pose)(truth, mean, cov)
     error = jax.vmap(consistency.pose_error)(truth, mean)
-    nees = jax.vmap(consistency.nees)(error, cov)
-    scored = jnp.isfinite(nees) & (nees >= 0)
     definite = jax.vmap(lambda P: jnp.all(jnp.stack(ldl(Matrix.symmetric(P))[1]) > 0))(cov)
     return Score(
-        scored=scored.sum(),
-        nees=jnp.sum(nees, where=scored),
+        scored=score.scored.sum(),
+        nees=jnp.sum(score.nees),
         position_square=jnp.sum(error[:, :2] ** 2),
         yaw_square=jnp.sum(error[:, 2] ** 2),
         flagged=jnp.sum(~ok),

@@ -260,8 +260,8 @@ def _figures(out: Path, source: Source, report: dict[str, Any], before: Any, aft
             "time": after[name]["time"],
             "before": before[name],
             "after": after[name],
-            "nees_before": before[name]["nees"],
-            "nees_after": after[name]["nees"],
+            "nees_before": before[name]["nees_per_step"],
+            "nees_after": after[name]["nees_per_step"],
         }
         for name in after
         if isinstance(after[name], dict) and after[name].get("anees") is not None
@@ -275,7 +275,7 @@ def _figures(out: Path, source: Source, report: dict[str, Any], before: Any, aft
 def _for_report(evidence: dict[str, Any]) -> dict[str, Any]:
     """Without the long arrays of a log."""
     return {
-        name: {key: item for key, item in value.items() if key not in ("nees", "time")}
+        name: {key: item for key, item in value.items() if key != "time" and "_per_step" not in key}
         if isinstance(value, dict)
         else value
         for name, value in evidence.items()

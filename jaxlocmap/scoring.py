@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxlocmap import consistency, grid
 from jaxlocmap.stages import Sighting
 from jaxlocmap.types import Config, Gaussian
 from jaxlocmap.world import World, occupancy
 
-# A run has lost the robot where it is further off than this, and all but excludes that itself. The second half spares
-# a filter that has seen nothing for long and says so.
-_LOST_DISTANCE = 1.0  # m
-_LOST_NEES = consistency.chi2_quantile(1 - 1e-6, consistency.POSE_DIMENSION)
+PHASES = 4  # equal parts of a drive, each with an average NEES of its own
+# Edges of the bins in which runs are counted by their average NEES, for a median: 5 % apart. What lies beyond counts in
+# the first and the last bin.
+NEES_EDGES = np.exp(np.arange(math.log(0.1), math.log(1e4), 0.05))
 
 
 class MapTotals(NamedTuple):
@@ -29,19 +31,32 @@ class MapTotals(NamedTuple):
     occupied: jax.Array  # (bins,) how many of those cells are occupied
 
 
+class Averages(NamedTuple):
+    """Of one run, over its scored steps."""
+
+    nees: jax.Array  # ()
+    axis_nees: jax.Array  # (3,) of each axis alone, error² / σ²
+    within_two_sigma: jax.Array  # (3,) share of steps
+    covered: jax.Array  # (levels,) share of steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
+
+
 class Totals(NamedTuple):
     """What a run adds to a study. Every entry is a sum, over steps or observations, then over runs."""
 
     runs: jax.Array  # ()
+    exact_starts: jax.Array  # () runs whose true start was the prior's mean
     scored_runs: jax.Array  # () runs with any step scored
     scored: jax.Array  # (T,) steps whose covariance is one and whose NEES is finite
     nees: jax.Array  # (T,)
     error_square: tuple[jax.Array, ...]  # x, y, yaw: (T,) each, m², m², rad²
     variance: tuple[jax.Array, ...]  # the same of the filter's own
-    axis_nees: jax.Array  # (3,) of each axis alone, error² / σ²
-    within_two_sigma: jax.Array  # (3,)
-    covered: jax.Array  # (levels,) steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
-    run_nees: jax.Array  # (2,) the run's average NEES, and its square
+    average: Averages
+    average_square: Averages  # of each run's average, squared
+    phase_runs: jax.Array  # (PHASES,) runs with any step of the phase scored
+    phase_nees: jax.Array  # (2, PHASES) the run's average NEES in each phase, and its square
+    kept_runs: jax.Array  # () scored runs that have not diverged
+    kept_nees: jax.Array  # (2,) their average NEES, and its square
+    nees_bins: jax.Array  # (len(NEES_EDGES) + 1,) scored runs by their average NEES
     run_nis: jax.Array  # (2,) the run's average NIS, and its square
     observing_runs: jax.Array  # () runs with any observation scored
     observed: jax.Array  # (T,) observations whose NIS is finite
@@ -50,6 +65,7 @@ class Totals(NamedTuple):
     accepted: jax.Array  # (T,)
     lag_products: jax.Array  # (2,) range, bearing
     lag_squares: jax.Array  # (2,)
+    lag_spread: jax.Array  # (3, 2) of the run's own products and squares: products², products * squares, squares²
     lag_pairs: jax.Array  # ()
     flagged_steps: jax.Array  # () steps whose `Info.ok` is False
     diverged: jax.Array  # () 1 if the run lost the robot at any step, or ended without a finite belief
@@ -64,6 +80,8 @@ class StepTally(NamedTuple):
     axis_nees: jax.Array  # (3,)
     within_two_sigma: jax.Array  # (3,)
     covered: jax.Array  # (levels,)
+    phase_scored: jax.Array  # (PHASES,)
+    phase_nees: jax.Array  # (PHASES,)
     flagged: jax.Array  # ()
     lost: jax.Array  # ()
 
@@ -103,7 +121,8 @@ class PerStep(NamedTuple):
 def no_steps(zero: jax.Array) -> StepTally:
     """The tally before the first step. zero: () of the dtype to count in."""
     three, levels = jnp.full(3, zero), jnp.full(len(consistency.COVERAGE_LEVELS), zero)
-    return StepTally(zero, zero, three, three, levels, zero, zero)
+    phases = jnp.full(PHASES, zero)
+    return StepTally(zero, zero, three, three, levels, phases, phases, zero, zero)
 
 
 def no_sightings(zero: jax.Array) -> SightingTally:
@@ -113,33 +132,31 @@ def no_sightings(zero: jax.Array) -> SightingTally:
 
 
 def score_step(
-    belief: Gaussian, truth: jax.Array, ok: jax.Array, definite: jax.Array
+    belief: Gaussian, truth: jax.Array, ok: jax.Array, phase: jax.Array
 ) -> tuple[StepTally, tuple[jax.Array, ...], tuple[jax.Array, ...]]:
     """The tally of one step, and its squared error and variance along x, y, yaw.
 
     Args:
-        belief, truth: after the step. ok: () bool, as in `Info`. definite: () bool, whether the covariance is one.
+        belief, truth: after the step.
+        ok: () bool, as in `Info`.
+        phase: () int32, which part of the drive the step belongs to, the same for all runs.
     """
     dtype = truth.dtype
-    error = consistency.pose_error(truth, belief.mean)
-    nees = consistency.nees(error, belief.cov)
-    scored = definite & jnp.isfinite(nees) & (nees >= 0)
-    nees = jnp.where(scored, nees, 0)
-    squares = [jnp.where(scored, error[i] ** 2, 0) for i in range(3)]
-    variances = [jnp.where(scored, belief.cov[i, i], 0) for i in range(3)]
-    ratios = [jnp.where(scored, square / belief.cov[i, i], 0) for i, square in enumerate(squares)]
+    score = consistency.score_pose(truth, *belief)
+    scored, nees = score.scored, score.nees
     quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
-    lost = (squares[0] + squares[1] > _LOST_DISTANCE**2) & (nees > _LOST_NEES)
     tally = StepTally(
         scored=scored.astype(dtype),
         nees=nees,
-        axis_nees=jnp.stack(ratios),
-        within_two_sigma=jnp.stack([(scored & (ratio <= 4)).astype(dtype) for ratio in ratios]),
+        axis_nees=jnp.stack(score.axis_nees),
+        within_two_sigma=jnp.stack([(scored & (ratio <= 4)).astype(dtype) for ratio in score.axis_nees]),
         covered=jnp.stack([(scored & (nees < quantile)).astype(dtype) for quantile in quantiles]),
+        phase_scored=jnp.stack([jnp.where(phase == i, scored, False).astype(dtype) for i in range(PHASES)]),
+        phase_nees=jnp.stack([jnp.where(phase == i, nees, 0) for i in range(PHASES)]),
         flagged=(~ok).astype(dtype),
-        lost=lost.astype(dtype),
+        lost=score.lost.astype(dtype),
     )
-    return tally, tuple(squares), tuple(variances)
+    return tally, score.error_square, score.variance
 
 
 def score_sighting(
@@ -171,27 +188,43 @@ def run_totals(
     truth: jax.Array,
     belief: Gaussian,
     of_map: MapTotals | None,
+    *,
+    exact_start: bool,
 ) -> dict[str, Any]:
     """What one run adds to a study: the fields of `Totals` that are not `PerStep`, by name."""
     dtype = steps.nees.dtype
-    run_nees = steps.nees / jnp.maximum(steps.scored, 1)
-    run_nis = sightings.nis / jnp.maximum(sightings.observed, 1)
+    some, seen = jnp.maximum(steps.scored, 1), jnp.maximum(sightings.observed, 1)
+    average = Averages(*(x / some for x in (steps.nees, steps.axis_nees, steps.within_two_sigma, steps.covered)))
+    phase_nees = steps.phase_nees / jnp.maximum(steps.phase_scored, 1)
+    run_nis = sightings.nis / seen
     ended = jnp.all(jnp.isfinite(truth - belief.mean)) & jnp.all(jnp.isfinite(jnp.diagonal(belief.cov)))
+    diverged = (steps.lost > 0) | ~ended
+    scored = steps.scored > 0
+    kept = (scored & ~diverged).astype(dtype)
+    # Each run is counted at its lowest edge that lies above; differences make bins of these.
+    below = jnp.concatenate([average.nees < jnp.asarray(NEES_EDGES, dtype), jnp.full(1, scored)]) & scored
+    bins = below.astype(dtype) - jnp.concatenate([jnp.zeros(1, dtype), below[:-1].astype(dtype)])
+    products, squares = sightings.lag_products, sightings.lag_squares
     return dict(
         runs=jnp.ones((), dtype),
-        scored_runs=(steps.scored > 0).astype(dtype),
-        axis_nees=steps.axis_nees,
-        within_two_sigma=steps.within_two_sigma,
-        covered=steps.covered,
-        run_nees=jnp.stack([run_nees, run_nees**2]),
+        exact_starts=jnp.full((), exact_start, dtype),
+        scored_runs=scored.astype(dtype),
+        average=average,
+        average_square=jax.tree.map(jnp.square, average),
+        phase_runs=(steps.phase_scored > 0).astype(dtype),
+        phase_nees=jnp.stack([phase_nees, phase_nees**2]),
+        kept_runs=kept,
+        kept_nees=kept * jnp.stack([average.nees, average.nees**2]),
+        nees_bins=bins,
         run_nis=jnp.stack([run_nis, run_nis**2]),
         observing_runs=(sightings.observed > 0).astype(dtype),
         unscored_observations=sightings.unscored,
-        lag_products=sightings.lag_products,
-        lag_squares=sightings.lag_squares,
+        lag_products=products,
+        lag_squares=squares,
+        lag_spread=jnp.stack([products**2, products * squares, squares**2]),
         lag_pairs=sightings.lag_pairs,
         flagged_steps=steps.flagged,
-        diverged=((steps.lost > 0) | ~ended).astype(dtype),
+        diverged=diverged.astype(dtype),
         map=of_map,
     )
 

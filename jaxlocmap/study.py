@@ -1,4 +1,4 @@
-"""A consistency study: one simulated run scored against its truth, and the totals of many judged.
+"""A consistency study: one simulated run scored against its truth, and the totals of many basis.
 
 totals = monte_carlo(Study(scenario, config), key, runs, params, world, noise, prior).value
 report = summarise(totals, config)
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -21,6 +22,8 @@ from jaxlocmap.batching import cond, scan, sum_over_runs, zero_like_any
 from jaxlocmap.normals import words_of
 from jaxlocmap.pipeline import init
 from jaxlocmap.scoring import (
+    NEES_EDGES,
+    PHASES,
     Latest,
     MapTotals,
     PerStep,
@@ -37,7 +40,7 @@ from jaxlocmap.stages import correct, map_scan, predict, sound
 from jaxlocmap.types import Config, Gaussian, Params
 from jaxlocmap.world import World
 
-__all__ = ["MapTotals", "Study", "Totals", "summarise"]
+__all__ = ["MapTotals", "Study", "Totals", "reference_study", "summarise"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,6 +74,11 @@ class Study:
             add_up: what becomes of everything that is to be added up over runs, each step's as soon as it is there.
         """
         params.check()
+        if self.config.sensor_offset != self.scenario.sensor_offset:
+            raise ValueError(
+                f"config.sensor_offset: expected that of the scenario, {self.scenario.sensor_offset}, "
+                f"got {self.config.sensor_offset}"
+            )
         dtype = prior.mean.dtype
         params, world, noise = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, world, noise))
         config, scenario = self.config, self.scenario
@@ -113,9 +121,9 @@ class Study:
                 draws = simulate.draw_scan(words, k, scenario=scenario, dtype=dtype)
                 ranges = simulate.look_round(draws, pose, world, noise, scenario=scenario)
                 log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
-            definite = sound(belief)
-            ok = moved & (seen.unusable == 0) & definite
-            stepped, error_square, variance = score_step(belief, pose, ok, definite)
+            ok = moved & (seen.unusable == 0) & sound(belief)
+            phase = PHASES * k // scenario.steps
+            stepped, error_square, variance = score_step(belief, pose, ok, phase)
             at_step = PerStep(
                 stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted
             )
@@ -135,7 +143,8 @@ class Study:
         (pose, belief, log_odds, _, steps, sightings), per_step = scan(turn, begin, jnp.arange(scenario.steps))
         if log_odds is not None and config.grid is not None:
             log_odds = grid.clamp(log_odds, config.grid)
-        of_run = run_totals(steps, sightings, pose, belief, map_totals(log_odds, world, config))
+        of_map = map_totals(log_odds, world, config)
+        of_run = run_totals(steps, sightings, pose, belief, of_map, exact_start=scenario.exact_prior)
         return Totals(**per_step._asdict(), **add_up(of_run))
 
     def summed(self, key: jax.Array, counted: jax.Array, *args: Any, **kwargs: Any) -> Totals:
@@ -148,53 +157,112 @@ class Study:
         return self(key, *args, **kwargs, add_up=functools.partial(sum_over_runs, counted=counted))
 
 
-def _mean_over_runs(total_and_square: np.ndarray, runs: int, expected: float) -> consistency.Mean:
-    total, square = (float(value) for value in total_and_square)
-    return consistency.mean_over_runs(total, square, runs, expected)
+def _mean_over_runs(
+    total: np.ndarray, square: np.ndarray, runs: np.ndarray, expected: float, variance: float | None = None
+) -> consistency.Mean:
+    return consistency.mean_over_runs(float(total), float(square), round(float(runs)), expected, variance)
 
 
-def _by_axis(values: np.ndarray) -> dict[str, float]:
-    return dict(zip(("x", "y", "yaw"), values.tolist(), strict=True))
+def pose_means(totals: Any, config: Config) -> consistency.PoseMeans:
+    """The means over runs of the pose's statistics; arguments as of `summarise`."""
+    runs, sums, squares = totals.scored_runs, totals.average, totals.average_square
+
+    def shares(total: np.ndarray, square: np.ndarray, expected: float) -> consistency.Mean:
+        return _mean_over_runs(total, square, runs, expected, expected * (1 - expected))
+
+    three, levels = range(3), consistency.COVERAGE_LEVELS
+    steps = len(totals.nees)
+    edges = [-(-i * steps // PHASES) for i in range(PHASES + 1)]
+    return consistency.PoseMeans(
+        nees=_mean_over_runs(sums.nees, squares.nees, runs, consistency.POSE_DIMENSION),
+        kept_nees=_mean_over_runs(
+            totals.kept_nees[0], totals.kept_nees[1], totals.kept_runs, consistency.POSE_DIMENSION
+        ),
+        axis_nees=tuple(_mean_over_runs(sums.axis_nees[i], squares.axis_nees[i], runs, 1) for i in three),
+        within_two_sigma=tuple(
+            shares(sums.within_two_sigma[i], squares.within_two_sigma[i], consistency.WITHIN_TWO_SIGMA) for i in three
+        ),
+        covered=tuple(shares(sums.covered[i], squares.covered[i], level) for i, level in enumerate(levels)),
+        phases=tuple(
+            _mean_over_runs(
+                totals.phase_nees[0, i], totals.phase_nees[1, i], totals.phase_runs[i], consistency.POSE_DIMENSION
+            )
+            for i in range(PHASES)
+        ),
+        phase_spans=tuple((config.dt * (a + 1), config.dt * b) for a, b in itertools.pairwise(edges)),
+    )
 
 
-def summarise(totals: Any, config: Config) -> dict[str, Any]:
+def median_nees(bins: np.ndarray) -> float:
+    """Median of the runs' average NEES from `Totals.nees_bins`, to a few per cent of itself; NaN without a run."""
+    below = np.cumsum(bins)
+    if not below[-1] > 0:
+        return math.nan
+    half = below[-1] / 2
+    i = int(np.argmax(below >= half))
+    if i in (0, len(bins) - 1):
+        return float(NEES_EDGES[0] if i == 0 else math.inf)
+    share = (half - below[i - 1]) / bins[i]
+    return float(NEES_EDGES[i - 1] * (NEES_EDGES[i] / NEES_EDGES[i - 1]) ** share)
+
+
+def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, Any]:
     """Judge the totals of a study.
 
     Args:
-        totals: `Totals` of NumPy arrays, summed over runs. config: the filter's.
+        totals: `Totals` of NumPy arrays, summed over runs.
+        config: the filter's.
+        reference: `Totals` of a study, of other random numbers, whose filter is told the robot's own noise, from the
+            same start and behind the same gate (`reference_study`). What it shows takes the place of 3 in the verdict:
+            an exact start and a gate move the ANEES of an honest filter too. None: 3 is expected.
 
     Returns:
         The statistics by name, ready for JSON. The lag-one value of "bearing" is that of the bearing given the range,
-        since innovations are whitened in that order. `anees_band_95` comes from the spread between runs around 3;
-        `nees_band_95` is the χ² band of one step's mean over runs, and `nees_steps_in_band` the share of steps in it.
+        since innovations are whitened in that order; zero is expected of it without a gate. `anees_band_95` comes from
+        the spread between runs around 3; `nees_band_95` is the χ² band of one step's mean over runs, and
+        `nees_steps_in_band` the share of steps in it.
     """
     runs = round(float(totals.runs))
     steps = len(totals.nees)
     scored = np.where(totals.scored > 0, totals.scored, np.nan)
-    all_scored = max(float(totals.scored.sum()), 1.0)
-    observations = float(totals.observed.sum())
-    anees = _mean_over_runs(totals.run_nees, round(float(totals.scored_runs)), consistency.POSE_DIMENSION)
-    nis = _mean_over_runs(totals.run_nis, round(float(totals.observing_runs)), 2)
+    all_scored = float(totals.scored.sum())
+    observations = round(float(totals.observed.sum()))
+    means = pose_means(totals, config)
+    nis = _mean_over_runs(totals.run_nis[0], totals.run_nis[1], totals.observing_runs, 2)
     per_step = totals.nees / scored
     band = consistency.chi2_band(consistency.POSE_DIMENSION, runs)
     error_square, variance = np.stack(totals.error_square, -1), np.stack(totals.variance, -1)
-    rms = np.sqrt(error_square.sum(0) / all_scored)
+    rms = np.sqrt(error_square.sum(0) / max(all_scored, 1))
     rate = float(totals.accepted.sum()) / observations if observations else math.nan
-    lag = totals.lag_products / np.where(totals.lag_squares > 0, totals.lag_squares, np.nan)
+    lag, lag_error = consistency.lag_correlation(
+        totals.lag_products, totals.lag_squares, totals.lag_spread, runs, float(totals.lag_pairs)
+    )
+    lag_reach = (consistency.student_t(runs) if runs > 1 else 1.96) * lag_error
     diverged = round(float(totals.diverged))
     observing = totals.observed > 0
+    basis = consistency.Basis(
+        runs=runs,
+        steps=round(all_scored),
+        diverged=diverged,
+        exact_start=bool(totals.exact_starts > 0),
+        gate=config.gate_probability is not None,
+        reference=None if reference is None else pose_means(reference, config),
+    )
     report = {
         "runs": runs,
         "steps": steps,
-        "anees": anees.value,
-        "anees_standard_error": anees.standard_error,
-        "anees_band_95": anees.band_95,
+        **consistency.pose_fields(means),
+        "anees_undiverged": means.kept_nees.value,
+        "anees_undiverged_interval_95": means.kept_nees.interval_95,
+        "anees_median_run": median_nees(totals.nees_bins),
+        "anees_reference": None if basis.reference is None else basis.reference.nees.value,
+        "exact_start": basis.exact_start,
         "nis_mean": nis.value,
         "nis_standard_error": nis.standard_error,
         "nis_band_95": nis.band_95,
         "nees_per_step": per_step.tolist(),
         "nees_band_95": band,
-        "nees_steps_in_band": float(np.mean((per_step >= band[0]) & (per_step <= band[1]))),
+        **consistency.share_in_band(per_step[totals.scored > 0], band),
         "nis_per_step": [
             float(total / count) if count else None for total, count in zip(totals.nis, totals.observed, strict=True)
         ],
@@ -203,39 +271,48 @@ def summarise(totals: Any, config: Config) -> dict[str, Any]:
         ],
         "rmse_per_step": np.sqrt(error_square / scored[:, None]).tolist(),
         "sigma_per_step": np.sqrt(variance / scored[:, None]).tolist(),
-        # Where one axis is claimed too well and another too badly, the NEES of all three can look right.
-        "axis_nees": _by_axis(totals.axis_nees / all_scored),
-        "within_two_sigma": _by_axis(totals.within_two_sigma / all_scored),
-        **{
-            f"coverage_{round(100 * level)}": float(count) / all_scored
-            for level, count in zip(consistency.COVERAGE_LEVELS, totals.covered, strict=True)
-        },
         "rmse_position_m": float(np.hypot(rms[0], rms[1])),
         "rmse_yaw_rad": float(rms[2]),
-        "observations": round(observations),
+        "observations": observations,
         "observing_steps": int(observing.sum()),
         "gate_accept_rate": rate,
         "gate_nominal_rate": config.gate_probability,
-        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability, round(observations)),
-        "innovation_lag_one": {"range": float(lag[0]), "bearing": float(lag[1])},
-        "innovation_lag_one_band_95": 1.96 / math.sqrt(float(totals.lag_pairs)) if totals.lag_pairs else None,
+        "gate_verdict": consistency.gate_verdict(rate, config.gate_probability, observations),
+        "innovation_lag_one": consistency.by_component(lag),
+        "innovation_lag_one_band_95": consistency.by_component(lag_reach),
         "diverged_runs": diverged,
         "unscored_observations": round(float(totals.unscored_observations)),
-        "unscored_steps": round(runs * steps - float(totals.scored.sum())),
+        "unscored_steps": round(runs * steps - all_scored),
         "flagged_steps": round(float(totals.flagged_steps)),
-        "verdict": consistency.verdict(anees.value, anees.band_95, diverged, runs),
+        "verdict": consistency.verdict(means, basis),
     }
     if totals.map is not None:
-        cells = totals.map.cells
-        some = np.maximum(cells, 1)
-        report["map"] = {
-            "entropy_bits": float(totals.map.entropy_bits) / runs,
-            "brier": float(totals.map.brier / totals.map.scored) if totals.map.scored else math.nan,
-            "calibration_error": float(np.abs(totals.map.probability - totals.map.occupied).sum() / cells.sum())
-            if totals.map.scored
-            else math.nan,
-            "calibration_cells": (cells / runs).tolist(),
-            "calibration_probability": np.where(cells > 0, totals.map.probability / some, 0).tolist(),
-            "calibration_frequency": np.where(cells > 0, totals.map.occupied / some, 0).tolist(),
-        }
+        report["map"] = _map_fields(totals.map, runs)
     return report
+
+
+def _map_fields(totals: MapTotals, runs: int) -> dict[str, Any]:
+    cells, mapped = totals.cells, bool(totals.scored)
+    some = np.maximum(cells, 1)
+    base_rate = float(totals.occupied.sum() / cells.sum()) if mapped else math.nan
+    return {
+        "entropy_bits": float(totals.entropy_bits) / runs,
+        "brier": float(totals.brier / totals.scored) if mapped else math.nan,
+        # What a map scores that knows how many of the seen cells are occupied, but not which.
+        "brier_base_rate": base_rate * (1 - base_rate),
+        "calibration_error": float(np.abs(totals.probability - totals.occupied).sum() / cells.sum())
+        if mapped
+        else math.nan,
+        "calibration_cells": (cells / runs).tolist(),
+        "calibration_probability": np.where(cells > 0, totals.probability / some, 0).tolist(),
+        "calibration_frequency": np.where(cells > 0, totals.occupied / some, 0).tolist(),
+    }
+
+
+def reference_study(scenario: simulate.Scenario, config: Config, noise: simulate.Noise) -> tuple[Study, Params]:
+    """The study of a filter that is told the truth, and what it is told: the robot's own noise and motion model.
+
+    Its ANEES is what this start and this gate make of an honest covariance. It maps nothing.
+    """
+    told = dataclasses.replace(config, motion="euler", grid=None)
+    return Study(scenario, told), simulate.own_params(noise, scenario.dt)

@@ -42,7 +42,46 @@ def test_nees_is_the_quadratic_form_with_the_inverse(tolerance):
 
 
 def test_nees_of_a_singular_covariance_is_no_number():
-    assert not np.isfinite(consistency.nees(jnp.ones(3), jnp.diag(jnp.array([1.0, 1.0, 0.0]))))
+    for last in (0.0, -1.0, math.nan):  # a covariance of no width, one that is none, one that is no number
+        assert math.isnan(consistency.nees(jnp.ones(3), jnp.diag(jnp.array([1.0, 1.0, last]))))
+
+
+def test_an_indefinite_covariance_with_a_positive_diagonal_is_none():
+    P = jnp.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    assert math.isnan(consistency.nees(jnp.array([1.0, -1.0, 0.0]), P))  # the plain quadratic form is -2
+
+
+@pytest.mark.parametrize(
+    ("atom", "shapes"),
+    [
+        ("pose_error", [(5, 3), (3,)]),
+        ("pose_error", [(3,), (2,)]),
+        ("nees", [(5, 3), (3, 3)]),
+        ("nees", [(3,), (5, 3, 3)]),
+        ("whiten", [(5, 2), (2, 2)]),
+        ("whiten", [(2,), (5, 2, 2)]),
+        ("score_pose", [(5, 3), (5, 3), (5, 3, 3)]),
+    ],
+)
+def test_atoms_refuse_a_batch(atom, shapes):
+    with pytest.raises(ValueError, match="expected shape"):
+        getattr(consistency, atom)(*(jnp.ones(shape) for shape in shapes))
+
+
+def test_the_score_of_a_pose_is_its_parts():
+    P, truth, mean = covariances(1, 3)[0], np.array([1.0, 2.0, 3.1]), np.array([1.1, 1.9, -3.1])
+    score = consistency.score_pose(*map(jnp.array, (truth, mean, P)))
+    error = np.array([-0.1, 0.1, 6.2 - 2 * math.pi])
+    assert score.scored
+    assert float(score.nees) == pytest.approx(reference.nees(error, P), rel=1e-3)
+    np.testing.assert_allclose(score.error_square, error**2, atol=1e-6)
+    np.testing.assert_allclose(score.variance, np.diag(P), rtol=1e-6)
+    np.testing.assert_allclose(score.axis_nees, error**2 / np.diag(P), rtol=1e-4)
+    assert not score.lost  # though its NEES says so, it is not a metre off
+    assert consistency.score_pose(jnp.array(truth) + 1, jnp.array(mean), jnp.array(P)).lost
+    none = consistency.score_pose(jnp.array(truth), jnp.array(mean), -jnp.array(P))
+    assert not none.scored
+    assert not np.any(jax.tree.leaves(none))
 
 
 def test_whitened_innovations_are_uncorrelated_with_unit_variance():
@@ -156,14 +195,16 @@ def test_the_band_over_runs_is_student_s_t(runs):
 
 
 def test_one_run_has_a_value_and_no_band():
-    value, error, band = judged([2.5], 3)
+    value, error, samples, band = judged([2.5], 3)
+    assert samples == 1
     assert value == 2.5
     assert math.isnan(error)
     assert band == (-math.inf, math.inf)
 
 
 def test_no_run_has_no_value():
-    value, error, band = consistency.mean_over_runs(0.0, 0.0, 0, 3)
+    value, error, samples, band = consistency.mean_over_runs(0.0, 0.0, 0, 3)
+    assert samples == 0
     assert math.isnan(value)
     assert math.isnan(error)
     assert band == (-math.inf, math.inf)
@@ -183,7 +224,6 @@ def test_a_lost_run_does_not_widen_the_band_until_it_holds_the_lost_run():
         with np.errstate(over="ignore"):
             mean = judged([*honest, lost], 3)
         assert not mean.band_95[0] <= mean.value <= mean.band_95[1]
-        assert consistency.verdict(mean.value, mean.band_95).startswith("over-confident")
 
 
 @functools.cache
@@ -213,104 +253,53 @@ def test_a_chi2_band_over_runs_times_steps_does_not_hold_it():
     assert np.mean((low <= means) & (means <= high)) < 0.6
 
 
-# --- Words ---
+# --- One run, whose values are correlated in time ---
 
 
-@pytest.mark.parametrize(
-    ("anees", "band", "expected"),
-    [
-        (3.02, (2.9, 3.1), "consistent: ANEES 3.02 lies in its 95 % band [2.9, 3.1]"),
-        (2.9, (2.9, 3.1), "consistent: ANEES 2.9 lies in its 95 % band [2.9, 3.1]"),
-        (
-            1.5,
-            (2.9, 3.1),
-            "under-confident: covariance 2 times too large (ANEES 1.5, 3 expected, 95 % band [2.9, 3.1])",
-        ),
-        (12.0, (2.9, 3.1), "over-confident: covariance 4 times too small (ANEES 12, 3 expected, 95 % band [2.9, 3.1])"),
-        (12.0, None, "over-confident: covariance 4 times too small (ANEES 12, 3 expected, one run gives no band)"),
-        (2.0, None, "under-confident: covariance 1.5 times too large (ANEES 2, 3 expected, one run gives no band)"),
-        (
-            0.0,
-            (2.9, 3.1),
-            "under-confident: covariance inf times too large (ANEES 0, 3 expected, 95 % band [2.9, 3.1])",
-        ),
-        (
-            10138.2,
-            None,
-            "over-confident: covariance 3,379 times too small (ANEES 10,138, 3 expected, one run gives no band)",
-        ),
-        (math.nan, (2.9, 3.1), "not consistent: the NEES is not finite"),
-        (math.inf, None, "not consistent: the NEES is not finite"),
-    ],
-)
-def test_the_verdict_names_the_side_and_size_of_the_misfit(anees, band, expected):
-    assert consistency.verdict(anees, band) == expected
+def honest_nees(rng, runs, steps, rho):
+    """NEES (runs, steps) of an honest filter whose errors are AR(1)."""
+    return np.sum(correlated_noise(rng, (steps, runs, 3), rho) ** 2, axis=-1).T
 
 
-@pytest.mark.parametrize("anees", [0.1, 3.0, 47.0])
-def test_a_run_without_a_band_is_never_called_consistent(anees):
-    text = consistency.verdict(anees, (-math.inf, math.inf))
-    assert text.startswith({0.1: "under-confident", 3.0: "undecided", 47.0: "over-confident"}[anees])
-    assert "one run gives no band" in text
+@pytest.mark.parametrize("rho", [0.0, 0.8, 0.98])
+def test_the_correlation_time_is_that_of_the_process(rho):
+    # NEES of AR(1) errors has the correlation rho² at lag one: τ = (1 + rho²) / (1 - rho²).
+    expected = (1 + rho**2) / (1 - rho**2)
+    found = [consistency.correlation_time(x) for x in honest_nees(np.random.default_rng(7), 40, 20_000, rho)]
+    assert np.mean(found) == pytest.approx(expected, rel=0.15)
 
 
-@pytest.mark.parametrize("anees", [3.0, 1.0, 9.0, math.nan])
-def test_diverged_runs_are_in_every_verdict(anees):
-    assert consistency.verdict(anees, (2.9, 3.1), 4, 100).endswith("; 4 of 100 runs diverged")
-    assert not consistency.verdict(anees, (2.9, 3.1), 4, 100).startswith("consistent")
-    assert "diverged" not in consistency.verdict(anees, (2.9, 3.1), 0, 100)
+@pytest.mark.parametrize(("rho", "steps"), [(0.0, 200), (0.9, 2000), (0.98, 10_000)])
+def test_the_band_of_one_run_holds_the_mean_of_an_honest_one(rho, steps):
+    held = 0
+    for values in honest_nees(np.random.default_rng(8), 400, steps, rho):
+        mean = consistency.mean_over_time(values, 3)
+        held += mean.band_95[0] <= mean.value <= mean.band_95[1]
+    low, high = scipy.stats.binom.ppf([1e-4, 1 - 1e-4], 400, 0.94)  # near 95 %: a sum of χ² is a little skewed
+    assert low <= held <= max(high, 394)
 
 
-@pytest.mark.parametrize(
-    ("rate", "nominal", "begins"),
-    [
-        (0.7, None, "no gate: every observation is used"),
-        (math.nan, 0.99, "nothing observed: the gate was never asked"),
-        (0.3, 0.99, "locked out: the gate rejected 70 % of the observations, 1 % expected"),
-        (0.96, 0.99, "too tight: the gate rejected 4 % of the observations, 1 % expected"),
-        (0.998, 0.99, "too loose: the gate rejected 0.2 % of the observations, 1 % expected"),
-        (1.0, 0.99, "too loose: the gate rejected 0 % of the observations, 1 % expected"),
-        (0.985, 0.99, "the gate rejected 1.5 % of the observations, 1 % expected"),
-        (0.4, 0.4, "the gate rejected 60 % of the observations, 60 % expected"),
-        (0.1, 0.4, "locked out: the gate rejected 90 % of the observations, 60 % expected"),
-    ],
-)
-def test_the_gate_s_verdict(rate, nominal, begins):
-    assert consistency.gate_verdict(rate, nominal).startswith(begins)
+def test_a_series_too_short_to_tell_its_correlation_is_worth_one_value():
+    assert consistency.correlation_time(np.arange(10.0)) == 10  # a trend
+    assert consistency.correlation_time(np.ones(5)) == 5
+    assert consistency.mean_over_time(np.arange(10.0), 3).samples == 1
 
 
-@pytest.mark.parametrize(
-    ("rejected", "observations", "word"),
-    [
-        (0, 100, None),  # a good filter shows none in 37 studies of 100
-        (0, 1000, "too loose"),
-        (2, 40, None),  # one in 16
-        (8, 100, "too tight"),
-        (60, 100, "locked out"),
-        (1, 1, "locked out"),
-    ],
-)
-def test_few_observations_do_not_condemn_a_gate(rejected, observations, word):
-    text = consistency.gate_verdict(1 - rejected / observations, 0.99, observations)
-    assert text.startswith(f"{word}: " if word else "the gate rejected")
+def test_a_filter_that_is_wrong_by_much_makes_no_wide_band():
+    values = 100 * honest_nees(np.random.default_rng(9), 1, 2000, 0.9)[0]
+    mean = consistency.mean_over_time(values, 3)
+    assert mean.band_95[1] < 4
+    assert mean.interval_95[0] < 300 < mean.interval_95[1]  # around what was measured
 
 
-def test_a_good_gate_is_condemned_in_at_most_5_studies_of_100():
-    for observations in (10, 50, 200, 1000, 10_000):
-        counts = np.arange(observations + 1)
-        chance = scipy.stats.binom.pmf(counts, observations, 0.01)
-        likely = counts[chance > 1e-12]
-        condemned = [
-            not consistency.gate_verdict(1 - count / observations, 0.99, observations).startswith("the gate")
-            for count in likely
-        ]
-        assert chance[likely][np.array(condemned)].sum() <= 0.05
+def test_the_interval_around_a_mean_is_student_s_t():
+    values = 3 + np.random.default_rng(1).normal(size=12)
+    expected = scipy.stats.t.interval(0.95, 11, loc=values.mean(), scale=scipy.stats.sem(values))
+    assert judged(values, 3).interval_95 == pytest.approx(expected, rel=1e-6)
+    assert judged([1.0], 3).interval_95 == (-math.inf, math.inf)
 
 
-def test_shares_below_are_the_ellipsoids_shares():
-    values = scipy.stats.chi2.ppf((np.arange(1000) + 0.5) / 1000, 3)
-    assert consistency.shares_below(values) == {0.5: 0.5, 0.9: 0.9, 0.95: 0.95, 0.99: 0.99}
-    assert consistency.shares_below(values / 4, (0.5,))[0.5] == pytest.approx(
-        scipy.stats.chi2.cdf(4 * scipy.stats.chi2.ppf(0.5, 3), 3), abs=1e-3
-    )
-    assert consistency.shares_below(np.array([0.1, np.nan]), (0.9,)) == {0.9: 0.5}  # no number is in no ellipsoid
+@pytest.mark.parametrize(("count", "trials"), [(0, 10), (3, 10), (10, 10), (29_000, 1_000_000)])
+def test_the_binomial_interval_is_scipy_s(count, trials):
+    expected = scipy.stats.binomtest(count, trials).proportion_ci(0.95, method="exact")
+    assert consistency.binomial_interval(count, trials) == pytest.approx(tuple(expected), rel=1e-9, abs=1e-12)

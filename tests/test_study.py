@@ -16,8 +16,9 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxlocmap import GridSpec, Params, batching, init, run, simulate
 from jaxlocmap.consistency import COVERAGE_LEVELS
 from jaxlocmap.monte_carlo import monte_carlo
+from jaxlocmap.scoring import NEES_EDGES, PHASES, Averages
 from jaxlocmap.simulate import CAPSTONE, LOOP, Noise
-from jaxlocmap.study import MapTotals, Study, Totals, summarise
+from jaxlocmap.study import MapTotals, Study, Totals, median_nees, summarise
 
 # What the plant really does, seen by a first-order filter: the heading noise of a step is a yaw rate's as well.
 PLANT = {"v": 0.02, "w": math.hypot(0.01, 0.005 / 0.1), "range": 0.08, "bearing": 0.02}
@@ -93,14 +94,14 @@ def honest():
 def test_the_statistics_of_a_consistent_filter_are_the_expected_ones(honest):
     runs, report = honest[1.0]
     # The linearisation's own part, measured with 4,000 runs: ANEES 3.005 ± 0.008, NIS 2.0001 ± 0.0010.
-    assert abs(report["anees"] - 3) < ERRORS * standard_error(runs.run_nees[:, 0]) + 0.02
+    assert abs(report["anees"] - 3) < ERRORS * standard_error(runs.average.nees) + 0.02
     assert abs(report["nis_mean"] - 2) < ERRORS * standard_error(runs.run_nis[:, 0]) + 0.002
     for i, level in enumerate(COVERAGE_LEVELS):
-        shares = runs.covered[:, i] / HONEST.steps
+        shares = runs.average.covered[:, i]
         assert report[f"coverage_{round(100 * level)}"] == pytest.approx(shares.mean())
         assert abs(shares.mean() - level) < ERRORS * standard_error(shares)
     for i, share in enumerate(report["within_two_sigma"].values()):
-        shares = runs.within_two_sigma[:, i] / HONEST.steps
+        shares = runs.average.within_two_sigma[:, i]
         assert share == pytest.approx(shares.mean())
         assert abs(share - scipy.stats.chi2.cdf(4, 1)) < ERRORS * standard_error(shares)
     # Steps of a run are correlated, so the share of them in their band spreads more than a binomial.
@@ -110,14 +111,15 @@ def test_the_statistics_of_a_consistent_filter_are_the_expected_ones(honest):
 
 def test_the_innovations_of_a_consistent_filter_are_white(honest):
     report = honest[1.0][1]
-    for lag in report["innovation_lag_one"].values():
-        assert abs(lag) < ERRORS / 1.96 * report["innovation_lag_one_band_95"]
-    assert report["innovation_lag_one_band_95"] < 0.004  # so a correlation of 0.01 would be seen
+    for name, lag in report["innovation_lag_one"].items():
+        band = report["innovation_lag_one_band_95"][name]
+        assert abs(lag) < ERRORS / 1.96 * band
+        assert band < 0.004  # so a correlation of 0.01 would be seen
 
 
 def test_the_bands_of_a_study_are_the_spread_between_its_runs(honest):
     runs, report = honest[1.0]
-    for name, averages, expected in (("anees", runs.run_nees[:, 0], 3), ("nis", runs.run_nis[:, 0], 2)):
+    for name, averages, expected in (("anees", runs.average.nees, 3), ("nis", runs.run_nis[:, 0], 2)):
         error = standard_error(averages)
         assert report[f"{name}_standard_error"] == pytest.approx(error, rel=1e-4)
         band = scipy.stats.t.interval(0.95, len(averages) - 1, loc=expected, scale=error)
@@ -140,11 +142,14 @@ def test_a_drawn_prior_is_honest_before_anything_is_observed(honest):
 def test_a_covariance_wrong_by_a_factor_is_reported_with_that_factor(honest, scale, words):
     # Scaling Q and R alike leaves the gain of a filter that has forgotten its prior as it is and scales P and S.
     runs, report = honest[scale]
-    assert abs(report["anees"] * scale - 3) < ERRORS * standard_error(runs.run_nees[:, 0]) * scale + 0.1
+    assert abs(report["anees"] * scale - 3) < ERRORS * standard_error(runs.average.nees) * scale + 0.1
     assert abs(report["nis_mean"] * scale - 2) < ERRORS * standard_error(runs.run_nis[:, 0]) * scale + 0.02
     assert report["verdict"].startswith("under-confident" if scale > 1 else "over-confident")
-    factor = float(re.search(rf"covariance ([\d.]+) times {words}", report["verdict"])[1])
+    factor, low, high = map(
+        float, re.search(rf"covariance ([\d.]+) \[([\d.]+), ([\d.]+)\] times {words}", report["verdict"]).groups()
+    )
     assert factor == pytest.approx(4, rel=0.05)
+    assert low < factor < high
 
 
 # --- The course's drive with and without its mistakes ---
@@ -171,11 +176,17 @@ def capstones():
 )
 def test_the_anees_of_the_course_s_drive(capstones, motion, params, anees):
     runs, report = capstones[motion, params]
-    assert abs(report["anees"] - anees) < ERRORS * standard_error(runs.run_nees[:, 0])
+    assert abs(report["anees"] - anees) < ERRORS * standard_error(runs.average.nees)
     # The true start is the prior's mean, so the first steps, and with them the average, lie below 3 even for the
     # plant's own noise.
     assert report["nees_per_step"][0] < 2
-    assert report["verdict"].startswith("under-confident")
+    assert report["exact_start"]
+    if params == "plant":  # the filter is right: what is off is the start's and the gate's
+        assert report["verdict"].startswith("undecided")
+        assert "exact start" in report["verdict"]
+    else:
+        assert report["verdict"].startswith("not consistent: error² over σ² of x")
+        assert "times too" not in report["verdict"]  # no factor follows from such a study
 
 
 def test_the_accuracy_of_the_course_s_drive(capstones):
@@ -208,11 +219,9 @@ def test_map_scores_are_there_only_with_a_grid(capstones, faulty):
 
 
 SHORT_CONFIG = SHORT.config(motion="euler")
-# Sightings that can be false, a sensor that the filter mounts elsewhere, and a gate that is a value.
-LIED = dataclasses.replace(LOOP, name="lied", steps=40, sight_period=3, outliers=True)
-LIED_CONFIG = dataclasses.replace(
-    LIED.config(gate_probability=None, grid=False), sensor_offset=(0.1, -0.05, 0.03), dt=0.2
-)
+# Sightings that can be false, a sensor off the robot's centre, a filter of another period, and a gate that is a value.
+LIED = dataclasses.replace(LOOP, name="lied", steps=40, sight_period=3, outliers=True, sensor_offset=(0.1, -0.05, 0.03))
+LIED_CONFIG = dataclasses.replace(LIED.config(gate_probability=None, grid=False), dt=0.2)
 
 
 short = functools.partial(studied, scenario=SHORT, config=SHORT_CONFIG)
@@ -265,11 +274,13 @@ def by_hand(args, scenario, config):
         truth, inputs, info, log_odds, true_map = jax.tree.map(lambda x, i=i: x[i], double)
         report = {"mean": info.belief.mean, "cov": info.belief.cov, "innovation": info.innovation, "S": info.S}
         of_map = None if log_odds is None else map_score(log_odds, true_map)
-        runs.append(score(truth, inputs.valid, config.gate_probability, info.ok, of_map, **report))
+        runs.append(
+            score(truth, inputs.valid, config.gate_probability, info.ok, of_map, scenario.exact_prior, **report)
+        )
     return runs
 
 
-def score(truth, valid, gate, ok, of_map, *, mean, cov, innovation, S, **_):
+def score(truth, valid, gate, ok, of_map, exact_start=True, *, mean, cov, innovation, S, **_):
     """The totals of one run, in plain loops."""
     error = truth - mean
     error[:, 2] = reference.wrap(error[:, 2])
@@ -297,18 +308,34 @@ def score(truth, valid, gate, ok, of_map, *, mean, cov, innovation, S, **_):
             squares += white**2
             pairs += 1
         latest[j] = white
-    run_nees, run_nis = nees.sum() / max(scored.sum(), 1), nis.sum() / max(observed.sum(), 1)
+    count = max(scored.sum(), 1)
+    average = Averages(
+        nees=nees.sum() / count,
+        axis_nees=axis.sum(0) / count,
+        within_two_sigma=(scored[:, None] & (square <= 4 * variance)).sum(0) / count,
+        covered=np.array([(scored & (nees < scipy.stats.chi2.ppf(level, 3))).sum() for level in COVERAGE_LEVELS])
+        / count,
+    )
+    parts = [slice(-(-i * len(nees) // PHASES), -(-(i + 1) * len(nees) // PHASES)) for i in range(PHASES)]
+    phase_nees = np.array([nees[part].sum() / max(scored[part].sum(), 1) for part in parts])
+    run_nis, kept = nis.sum() / max(observed.sum(), 1), scored.any() and ended and not lost
+    bins = np.zeros(len(NEES_EDGES) + 1)
+    bins[np.searchsorted(NEES_EDGES, average.nees, side="right")] += scored.any()
     return Totals(
         runs=1,
+        exact_starts=exact_start,
         scored_runs=scored.any(),
         scored=scored,
         nees=nees,
         error_square=tuple(square.T),
         variance=tuple(variance.T),
-        axis_nees=axis.sum(0),
-        within_two_sigma=(scored[:, None] & (square <= 4 * variance)).sum(0),
-        covered=np.array([(scored & (nees < scipy.stats.chi2.ppf(level, 3))).sum() for level in COVERAGE_LEVELS]),
-        run_nees=np.array([run_nees, run_nees**2]),
+        average=average,
+        average_square=jax.tree.map(np.square, average),
+        phase_runs=np.array([scored[part].any() for part in parts]),
+        phase_nees=np.stack([phase_nees, phase_nees**2]),
+        kept_runs=kept,
+        kept_nees=kept * np.array([average.nees, average.nees**2]),
+        nees_bins=bins,
         run_nis=np.array([run_nis, run_nis**2]),
         observing_runs=observed.any(),
         observed=observed,
@@ -317,6 +344,7 @@ def score(truth, valid, gate, ok, of_map, *, mean, cov, innovation, S, **_):
         accepted=accepted,
         lag_products=products,
         lag_squares=squares,
+        lag_spread=np.stack([products**2, products * squares, squares**2]),
         lag_pairs=pairs,
         flagged_steps=np.sum(~ok),
         diverged=lost or not ended,
@@ -571,19 +599,19 @@ def test_a_belief_that_is_no_number_is_lost_unscored_and_not_an_error_of_zero(fa
     assert report["diverged_runs"] == 1
     assert report["unscored_steps"] == report["flagged_steps"] == SHORT.steps
     assert math.isnan(report["anees"])
-    assert report["verdict"] == "not consistent: the NEES is not finite; 1 of 1 runs diverged"
+    assert report["verdict"].startswith("not consistent: no NEES is finite; 1 of 1 runs diverged")
     both = faulty_report(faulty, "Q", "none")
     assert both["anees"] == healthy["anees"]
     assert both["nis_mean"] == healthy["nis_mean"]
     assert both["rmse_position_m"] == healthy["rmse_position_m"]
-    assert both["verdict"].endswith("; 1 of 2 runs diverged")
+    assert "; 1 of 2 runs diverged, which a gate can bring about by itself" in both["verdict"]
 
 
 def test_steps_without_a_score_have_no_mean(faulty):
     report = faulty_report(faulty, "Q")
     assert np.isnan(report["nees_per_step"]).all()
     assert np.isnan(report["rmse_per_step"]).all()
-    assert report["nees_steps_in_band"] == 0
+    assert math.isnan(report["nees_steps_in_band"])
 
 
 def test_an_innovation_covariance_that_is_no_number_spoils_no_average(faulty):
@@ -599,7 +627,7 @@ def test_a_run_that_observes_nothing_is_judged_by_its_pose_alone(faulty):
     assert math.isnan(report["nis_mean"])
     assert math.isnan(report["gate_accept_rate"])
     assert report["gate_verdict"] == "nothing observed: the gate was never asked"
-    assert report["innovation_lag_one_band_95"] is None
+    assert all(map(math.isnan, report["innovation_lag_one_band_95"].values()))
     assert report["nis_chi2_band_95"] == report["nis_per_step"] == [None] * SHORT.steps
     assert math.isfinite(report["anees"])
 
@@ -623,8 +651,10 @@ def test_runs_that_are_a_metre_off_and_exclude_it_at_any_step_are_lost():
     assert np.any(lost & ~(far & excluded)[:, -1])  # found again at the end, and yet counted
     np.testing.assert_array_equal(runs.diverged, lost)
     report = summarise(sums(runs), SHORT_CONFIG)
-    assert report["verdict"].startswith("over-confident")
-    assert report["verdict"].endswith(f"; {lost.sum()} of {len(FAULTS)} runs diverged")
+    assert f"; {lost.sum()} of {len(FAULTS)} runs diverged" in report["verdict"]
+    kept = runs.average.nees[~lost]
+    expected = kept.mean() if len(kept) else math.nan
+    assert report["anees_undiverged"] == pytest.approx(expected, nan_ok=True)
 
 
 def test_a_run_that_is_far_off_and_says_so_is_not_lost():
@@ -649,7 +679,7 @@ def test_every_fault_is_counted_and_none_makes_the_study_no_number(faulty):
         assert math.isfinite(report[name]), name
     assert all(map(math.isfinite, report["innovation_lag_one"].values()))
     assert all(math.isfinite(report["map"][name]) for name in ("entropy_bits", "brier", "calibration_error"))
-    assert report["verdict"].endswith(f"of {len(FAULTS)} runs diverged")
+    assert f"of {len(FAULTS)} runs diverged" in report["verdict"]
 
 
 def test_a_study_of_one_run_has_values_and_no_band(faulty):
@@ -672,10 +702,18 @@ def hand_made():
         nees=np.array([8.0, 4.0]),
         error_square=(np.array([0.02, 0.06]), np.array([0.03, 0.05]), np.array([0.2, 0.12])),
         variance=(np.array([0.08, 0.5]), np.array([0.02, 0.72]), np.array([0.5, 0.02])),
-        axis_nees=np.array([2.0, 4.0, 6.0]),
-        within_two_sigma=np.array([4.0, 3.0, 2.0]),
-        covered=np.array([1.0, 2.0, 3.0, 4.0]),
-        run_nees=np.array([6.0, 20.0]),  # averages 2 and 4
+        exact_starts=np.array(0.0),
+        average=Averages(
+            np.array(6.0), np.array([1.0, 2.0, 3.0]), np.array([2.0, 1.5, 1.0]), np.array([0.5, 1.0, 1.5, 2.0])
+        ),
+        average_square=Averages(  # averages 2 and 4; 0.2 and 0.8, 0.5 and 1.5, 1 and 2; ...
+            np.array(20.0), np.array([0.68, 2.5, 5.0]), np.array([2.0, 1.25, 0.5]), np.array([0.25, 0.5, 1.25, 2.0])
+        ),
+        phase_runs=np.array([2.0, 0.0, 2.0, 0.0]),
+        phase_nees=np.array([[8.0, 0.0, 4.0, 0.0], [34.0, 0.0, 10.0, 0.0]]),
+        kept_runs=np.array(1.0),
+        kept_nees=np.array([2.0, 4.0]),
+        nees_bins=np.bincount(np.searchsorted(NEES_EDGES, [2.0, 4.0], "right"), minlength=len(NEES_EDGES) + 1),
         run_nis=np.array([5.0, 17.0]),  # averages 1 and 4
         observing_runs=np.array(2.0),
         observed=np.array([0.0, 2.0]),
@@ -684,6 +722,7 @@ def hand_made():
         accepted=np.array([0.0, 1.0]),
         lag_products=np.array([1.0, -2.0]),
         lag_squares=np.array([4.0, 4.0]),
+        lag_spread=np.array([[1.0, 2.0], [2.0, -4.0], [8.0, 8.0]]),
         lag_pairs=np.array(16.0),
         flagged_steps=np.array(1.0),
         diverged=np.array(1.0),
@@ -705,6 +744,9 @@ def test_a_report_of_totals_made_by_hand():
         "steps": 2,
         "anees": 3.0,
         "anees_standard_error": 1.0,
+        "anees_undiverged": 2.0,
+        "anees_reference": None,
+        "exact_start": False,
         "nis_mean": 2.5,
         "nis_standard_error": 1.5,
         "nees_per_step": [4.0, 2.0],
@@ -723,7 +765,6 @@ def test_a_report_of_totals_made_by_hand():
         "gate_accept_rate": 0.5,
         "gate_nominal_rate": 0.99,
         "innovation_lag_one": {"range": 0.25, "bearing": -0.5},
-        "innovation_lag_one_band_95": 0.49,
         "diverged_runs": 1,
         "unscored_steps": 0,
         "flagged_steps": 1,
@@ -738,10 +779,18 @@ def test_a_report_of_totals_made_by_hand():
     assert report["nees_band_95"] == pytest.approx(np.array(scipy.stats.chi2.interval(0.95, 6)) / 2)
     assert report["nis_chi2_band_95"][0] is None
     assert report["nis_chi2_band_95"][1] == pytest.approx(np.array(scipy.stats.chi2.interval(0.95, 4)) / 2)
-    assert report["verdict"].endswith("; 1 of 2 runs diverged")
+    # One degree of freedom again: the spread of each run's products around the correlation times its squares.
+    spread = np.sqrt(2 * np.array([1 - 2 * 0.25 * 2 + 0.25**2 * 8, 2 - 2 * 0.5 * 4 + 0.5**2 * 8])) / 4
+    assert list(report["innovation_lag_one_band_95"].values()) == pytest.approx(12.7062 * spread, abs=1e-4)
+    # Standard errors of two runs are half their distance: x 0.2 and 0.8.
+    assert report["axis_nees_interval_95"]["x"] == pytest.approx((0.5 - 12.706 * 0.3, 0.5 + 12.706 * 0.3), abs=1e-3)
+    assert [phase["anees"] for phase in report["nees_phases"]][::2] == [4.0, 2.0]
+    assert 2.0 <= report["anees_median_run"] <= 2.0 * math.exp(0.05)  # the lower one of two
+    assert "; 1 of 2 runs diverged" in report["verdict"]
     assert report["map"] == {
         "entropy_bits": 45.0,
         "brier": pytest.approx(0.15),
+        "brier_base_rate": pytest.approx(0.25 * 0.75),
         "calibration_error": pytest.approx((0.4 + 0.8) / 8),
         "calibration_cells": [3.0, 0.0, 1.0],
         "calibration_probability": pytest.approx([0.1, 0.0, 0.9]),
@@ -754,7 +803,23 @@ def test_runs_without_a_score_are_no_part_of_the_average():
     lost = totals._replace(runs=np.array(5.0), scored_runs=np.array(2.0), observing_runs=np.array(2.0))
     report = summarise(lost, SHORT_CONFIG)
     assert (report["runs"], report["anees"], report["nis_mean"]) == (5, 3.0, 2.5)
+    assert report["gate_verdict"].startswith("the gate rejected 50 % [1.26, 98.7] of 2 observations")
     assert report["unscored_steps"] == 6
+
+
+def test_the_median_of_the_runs_average_nees_is_numpy_s_to_a_bin():
+    values = np.random.default_rng(0).gamma(3, 1, 501)
+    bins = np.bincount(np.searchsorted(NEES_EDGES, values, "right"), minlength=len(NEES_EDGES) + 1)
+    assert median_nees(bins) == pytest.approx(np.median(values), rel=0.05)
+    assert math.isnan(median_nees(0 * bins))
+    assert median_nees(np.eye(len(bins))[-1]) == math.inf
+
+
+def test_a_study_of_a_sensor_that_sits_elsewhere_is_refused():
+    study = Study(SHORT, dataclasses.replace(SHORT_CONFIG, sensor_offset=(0.1, 0.0, 0.0)))
+    args = simulate.course_params(), simulate.room(), Noise(), SHORT.prior()
+    with pytest.raises(ValueError, match=r"config\.sensor_offset: expected that of the scenario, \(0\.0, 0\.0, 0\.0\)"):
+        study(jax.random.key(0), *args)
 
 
 def test_the_priors_dtype_wins_over_that_of_everything_else(x64):

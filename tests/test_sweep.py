@@ -204,18 +204,26 @@ def test_the_verdict_prefers_a_consistent_cell_that_fits_the_nis_as_well():
     assert none.startswith("none of 1 cells is consistent; ANEES and NIS together fit best at Q × 2, R × 1")
 
 
+def with_nees(totals, value):
+    """The same, every run's average NEES being `value`."""
+    average = totals.average._replace(nees=np.array(value * RUNS))
+    return totals._replace(
+        average=average, average_square=totals.average_square._replace(nees=np.array(value**2 * RUNS))
+    )
+
+
 def test_a_cell_is_judged_by_both_statistics_and_the_runs_lost(grid):
     totals = jax.tree.map(lambda total: total[1, 0], grid)
-    totals = totals._replace(run_nees=np.array([3.0, 9.0]) * RUNS, run_nis=np.array([2.0, 4.0]) * RUNS)
+    totals = with_nees(totals, 3.0)._replace(run_nis=np.array([2.0, 4.0]) * RUNS)
     totals = totals._replace(diverged=np.array(0.0))
     cell = sweep._judged(totals, settings())
     assert cell["misfit"] == pytest.approx(0, abs=1e-12)
     assert cell["consistent"]
     lost = sweep._judged(totals._replace(diverged=np.array(1.0)), settings())
     assert not lost["consistent"]
-    totals = totals._replace(run_nees=np.array([6.0, 36.0]) * RUNS, run_nis=np.array([1.0, 1.0]) * RUNS)
+    totals = with_nees(totals, 6.0)._replace(run_nis=np.array([1.0, 1.0]) * RUNS)
     assert sweep._judged(totals, settings())["misfit"] == pytest.approx(2 * math.log(2))
-    broken = sweep._judged(totals._replace(scored_runs=np.array(0.0), run_nees=np.zeros(2)), settings())
+    broken = sweep._judged(totals._replace(scored_runs=np.array(0.0)), settings())
     assert broken["misfit"] == math.inf
     assert not broken["consistent"]
 

@@ -104,15 +104,11 @@ def score(drives: Drives, means: np.ndarray, covs: np.ndarray) -> dict[str, floa
     """
     runs = len(means)
     means, covs = np.asarray(means, np.float64), np.asarray(covs, np.float64)
-    error = drives.truth[:runs] - means
-    error[..., 2] = _wrapped(error[..., 2])
+    report = consistency.judge(drives.truth[:runs], means, covs)
     usable = np.all(np.isfinite(means), axis=-1) & np.all(np.isfinite(covs), axis=(-1, -2))
     covs = np.where(usable[..., None, None], covs, np.eye(3))
     usable = usable & (np.linalg.eigvalsh(covs)[..., 0] > 0)
     covs = np.where(usable[..., None, None], covs, np.eye(3))
-    nees = np.where(usable, _squared_distance(covs, np.where(usable[..., None], error, 0)), np.nan)
-    far = np.hypot(error[..., 0], error[..., 1]) > 1
-    lost = np.any(far & (nees > consistency.chi2_quantile(1 - 1e-6, 3)), axis=1) | ~usable[:, -1]
 
     before = np.where(usable[..., None], means, PRIOR_MEAN)[:, 9:-1:10]
     F = _move_jacobian(before)
@@ -120,13 +116,9 @@ def score(drives: Drives, means: np.ndarray, covs: np.ndarray) -> dict[str, floa
     H = _see_jacobian(mean)
     S = H @ (F @ covs[:, 9:-1:10] @ np.swapaxes(F, -1, -2) + Q) @ np.swapaxes(H, -1, -2) + R
     nis = _squared_distance(S, _residual(drives.z[:runs, 10::10], _seen(mean)))
-    run_nees = np.nanmean(nees, axis=1)
     return {
-        "anees": float(np.nanmean(run_nees)),
-        "anees_standard_error": float(np.nanstd(run_nees) / np.sqrt(runs)),
+        **{name: report[name] for name in ("anees", "anees_standard_error", "rmse_position_m", "diverged_runs")},
         "nis_mean": float(np.mean(nis[usable[:, 9:-1:10]])),
-        "rmse_position_m": float(np.sqrt(np.mean(np.sum(error[usable, :2] ** 2, axis=-1)))),
-        "diverged_runs": int(lost.sum()),
         "unusable_steps": int((~usable).sum()),
     }
 

@@ -97,7 +97,7 @@ def to_timeline(
     arrays: tuple[Any, ...] = (time - previous, odometry[in_force], landmark, z, valid, ranges)
     counts["backward_truth"] = _backward(log.truth_time)
     truth_rows = _last_at_each_stamp(log.truth_time, counts, "duplicate_truth")
-    truth, truth_valid = _interpolate(log.truth_time[truth_rows], log.truth[truth_rows], time, max_gap)
+    truth, truth_valid = interpolate(log.truth_time[truth_rows], log.truth[truth_rows], time, max_gap)
     return Timeline(time, Inputs(*arrays), truth, truth_valid, counts)
 
 
@@ -142,7 +142,7 @@ def _slots(log: Log, rows: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np
     return landmark, z, valid
 
 
-def _interpolate(
+def interpolate(
     stamps: np.ndarray, poses: np.ndarray, time: np.ndarray, max_gap: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (T, 3) at `time`, headings along the shorter way round, and whether each is known (T,)."""

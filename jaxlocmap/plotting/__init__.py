@@ -1,7 +1,7 @@
 """Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. Nowhere else: matplotlib."""
 
 from jaxlocmap.plotting.maps import map_figure, trajectory_figure
-from jaxlocmap.plotting.studies import log_nees_figure, precision_figure, study_figure, sweep_figure
+from jaxlocmap.plotting.studies import judge_figure, precision_figure, study_figure, sweep_figure
 from jaxlocmap.plotting.tuning import (
     calibration_figure,
     descent_figure,
@@ -12,8 +12,8 @@ from jaxlocmap.plotting.tuning import (
 __all__ = [
     "calibration_figure",
     "descent_figure",
+    "judge_figure",
     "log_before_after_figure",
-    "log_nees_figure",
     "map_figure",
     "precision_figure",
     "study_before_after_figure",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from jaxlocmap.consistency import COVERAGE_LEVELS, chi2_quantile, readable
+from jaxlocmap.consistency import COVERAGE_LEVELS, readable
 from jaxlocmap.plotting.style import BAND, ESTIMATE, EXPECTED, TRUTH, from_zero
 
 _BEYOND = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
@@ -46,8 +47,58 @@ def study_figure(path: Path, report: dict[str, Any], dt: float) -> None:
     ax.set(title="NIS of range and bearing: 2 if consistent", xlabel="time [s]", ylabel="NIS [–]")
     from_zero(ax)
 
-    ax = axes[1, 0]
-    error, sigma = np.array(report["rmse_per_step"]), np.array(report["sigma_per_step"])
+    _errors(axes[1, 0], time, report)
+    _coverage_bars(axes[1, 1], report)
+    named = [report["scenario"]] if "scenario" in report else []
+    named += [f"{report['motion']} motion"] if "motion" in report else []
+    _title(figure, ", ".join([*named, f"{runs} runs"]), report["verdict"])
+    figure.savefig(path, dpi=120)
+
+
+def judge_figure(path: Path, report: dict[str, Any], where: np.ndarray, title: str = "") -> None:
+    """The report of `consistency.judge`: NEES over time with its band and the phases outside theirs, errors beside the
+    filter's own σ, coverage, and where the filter is sure of too much.
+
+    Args:
+        where: (T, 2) m, the true positions of one run at the report's steps; NaN where unknown.
+    """
+    figure = Figure(figsize=(14, 9), layout="constrained")
+    axes = figure.subplots(2, 2, width_ratios=(1.6, 1))
+    time, nees = np.array(report["time"]), np.array(report["nees_per_step"], float)
+    runs = report["runs"]
+    low, high = report["nees_band_95"]
+
+    ax = axes[0, 0]
+    band = "95 % of an honest filter's values, χ²(3)" if runs == 1 else f"95 % band, χ²(3·{runs})/{runs}"
+    ax.axhspan(low, high, color=BAND, alpha=0.25, label=band)
+    ax.plot(time, nees, color=ESTIMATE, lw=0.7, label="NEES" if runs == 1 else f"NEES, mean of {runs} runs")
+    ax.axhline(report["anees"], color=EXPECTED, ls="--", label=f"ANEES {readable(report['anees'])}")
+    for side, colour in (("over-confident", "tab:red"), ("under-confident", "tab:purple")):
+        for i, span in enumerate(s for s in report["dishonest"] if s["side"] == side):
+            label = side if i == 0 else None
+            ax.plot([span["from_s"], span["to_s"]], [span["anees"]] * 2, color=colour, lw=3, label=label)
+    ax.set(title="NEES of the pose: 3 if the covariance is honest", xlabel="time [s]", ylabel="NEES [–]", yscale="log")
+    ax.legend(fontsize=8)
+
+    _errors(axes[1, 0], time, report)
+    _coverage_bars(axes[1, 1], report)
+
+    ax = axes[0, 1]
+    ratio = np.clip(nees / 3, 1e-2, 1e3)
+    span = max(float(np.nanmax(np.abs(np.log10(ratio)), initial=0.5)), 0.5)
+    dots = ax.scatter(*where.T, c=ratio, s=4, cmap="RdBu_r", norm=LogNorm(10**-span, 10**span))
+    figure.colorbar(dots, ax=ax, label="NEES over 3 [–]: red is over-confident")
+    ax.set(title="Where", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    _title(figure, title, report["verdict"])
+    figure.savefig(path, dpi=120)
+
+
+def _title(figure: Figure, title: str, verdict: str) -> None:
+    figure.suptitle("\n".join(textwrap.wrap(" — ".join(filter(None, (title, verdict))), 130)), fontsize=11)
+
+
+def _errors(ax: Axes, time: np.ndarray, report: dict[str, Any]) -> None:
+    error, sigma = np.array(report["rmse_per_step"], float), np.array(report["sigma_per_step"], float)
     position = (np.hypot(*error[:, :2].T), np.hypot(*sigma[:, :2].T), "position", "m", ESTIMATE)
     heading = (error[:, 2], sigma[:, 2], "heading", "rad", "tab:red")
     for measured, claimed, name, unit, colour in (position, heading):
@@ -56,25 +107,6 @@ def study_figure(path: Path, report: dict[str, Any], dt: float) -> None:
     ax.set(title="How large the errors are, and how large the filter says", xlabel="time [s]", ylabel="[m] or [rad]")
     ax.set_yscale("log")
     ax.legend(fontsize=8)
-
-    _coverage_bars(axes[1, 1], [report[f"coverage_{round(100 * level)}"] for level in COVERAGE_LEVELS])
-    figure.suptitle(f"{report['scenario']}, {report['motion']} motion, {runs} runs — {report['verdict']}", fontsize=11)
-    figure.savefig(path, dpi=120)
-
-
-def log_nees_figure(path: Path, time: np.ndarray, nees: np.ndarray, report: dict[str, Any]) -> None:
-    """NEES of one drive over time on a log scale, and its coverage. NaN where there is no truth."""
-    figure = Figure(figsize=(12, 4.5), layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    low, high = (chi2_quantile(p, 3) for p in (0.025, 0.975))
-    left.axhspan(low, high, color=BAND, alpha=0.25, label="95 % of an honest filter's values, χ²(3)")
-    left.plot(time - time[0], nees, color=ESTIMATE, lw=0.6, label="NEES")
-    left.axhline(report["anees"], color=EXPECTED, ls="--", label=f"ANEES {readable(report['anees'])}")
-    left.set(title="NEES of the pose", xlabel="time [s]", ylabel="NEES [–]", yscale="log")
-    left.legend(fontsize=8)
-    _coverage_bars(right, [report[f"coverage_{round(100 * level)}"] for level in COVERAGE_LEVELS])
-    figure.suptitle(f"{report['log']} — {report['verdict']}", fontsize=11)
-    figure.savefig(path, dpi=120)
 
 
 def precision_figure(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -183,12 +215,17 @@ def _outline(ax: Axes, cells: np.ndarray, label: str) -> None:
     ax.hlines(rows - 0.5, columns - 0.5, columns + 0.5, color="black", lw=2.5)
 
 
-def _coverage_bars(ax: Axes, measured: list[float]) -> None:
-    place = np.arange(len(COVERAGE_LEVELS))
+def _coverage_bars(ax: Axes, report: dict[str, Any]) -> None:
+    """Measured shares with their 95 % intervals beside those expected."""
+    place, names = np.arange(len(COVERAGE_LEVELS)), [f"coverage_{round(100 * level)}" for level in COVERAGE_LEVELS]
+    measured = np.array([report[name] for name in names], float)
+    limits = np.array([report[f"{name}_interval_95"] for name in names], float)
+    reach = np.nan_to_num(100 * np.abs(limits.T - measured), posinf=0)
     ax.bar(place - 0.2, [100 * level for level in COVERAGE_LEVELS], 0.4, color=BAND, alpha=0.5, label="expected")
-    bars = ax.bar(place + 0.2, [100 * share for share in measured], 0.4, color=ESTIMATE, label="measured")
-    ax.bar_label(bars, fmt="%.1f", fontsize=8)
-    ax.set(title="Share of poses inside the filter's ellipsoid", ylabel="[%]", ylim=(0, 115))
+    ax.bar(place + 0.2, 100 * measured, 0.4, yerr=reach, capsize=4, color=ESTIMATE, label="measured, 95 % interval")
+    for x, share, up in zip(place + 0.2, 100 * measured, reach[1], strict=True):
+        ax.text(x, share + up + 1, f"{share:.1f}", ha="center", va="bottom", fontsize=8)
+    ax.set(title="Share of poses inside the filter's ellipsoid", ylabel="[%]", ylim=(0, 125))
     ax.set_xticks(place, [f"{100 * level:.0f} %" for level in COVERAGE_LEVELS])
     ax.set_xlabel("ellipsoid that should hold this share")
     ax.legend(fontsize=8, loc="upper left")

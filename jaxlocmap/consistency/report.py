@@ -1,0 +1,324 @@
+"""What the statistics say: the fields of a report, and verdicts that say what they rest on."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxlocmap.consistency.statistics import (
+    COVERAGE_LEVELS,
+    POSE_DIMENSION,
+    Mean,
+    binomial_interval,
+    mean_over_time,
+    ratio,
+    student_t,
+)
+
+AXES = ("x", "y", "yaw")
+_TOLERANCE = 0.01  # a misfit that is there, and that no one need mind
+_LITTLE = 1.25  # up to such a factor an exact start or a gate may be what moves the ANEES
+_ALIKE = 1.05  # axes whose variances are off by factors this close share one
+_SURE = 0.999  # what an axis is found wrong with, there being three of them
+_WIDE = 0.25  # of what is expected: a band this wide tells little
+_FEW_SAMPLES = 100  # independent ones of a single run: below, its correlation time is itself uncertain
+_FEW_STEPS = 20  # of a single run, or observations of a gate: no verdict
+_GATE_TOLERANCE = 1.5  # times the refusals expected
+_STREAK = 10  # refusals one after the other, of as many as a tenth of all: the filter is locked out
+
+
+class PoseMeans(NamedTuple):
+    """Means of the pose's statistics, over runs or over the steps of one."""
+
+    nees: Mean  # 3 expected
+    kept_nees: Mean  # the same without runs that diverged
+    axis_nees: tuple[Mean, ...]  # x, y, yaw: error² / σ², 1 expected
+    within_two_sigma: tuple[Mean, ...]  # x, y, yaw: 0.954 expected
+    covered: tuple[Mean, ...]  # one for each of `COVERAGE_LEVELS`
+    phases: tuple[Mean, ...]  # NEES of equal parts of the drive
+    phase_spans: tuple[tuple[float, float], ...]  # s, from and to, of each of them
+
+
+class Basis(NamedTuple):
+    """What a verdict has to know beside the means."""
+
+    runs: int
+    steps: int  # scored ones of all runs
+    diverged: int = 0  # runs
+    exact_start: bool = False  # the true start is the prior's mean, of which the filter's prior knows nothing
+    gate: bool = False
+    reference: PoseMeans | None = None  # of a filter told the robot's own noise: same start, same gate
+
+
+def pose_fields(means: PoseMeans) -> dict[str, Any]:
+    """The fields of a report that hold what is known of the pose's covariance.
+
+    `x_interval_95` is a 95 % interval around the measured x, `anees_band_95` where the ANEES may lie if the filter is
+    consistent.
+    """
+    nees = means.nees
+    return {
+        "anees": nees.value,
+        "anees_standard_error": nees.standard_error,
+        "anees_band_95": nees.band_95,
+        "anees_interval_95": nees.interval_95,
+        "independent_samples": nees.samples,
+        "nees_phases": [
+            {"from_s": begin, "to_s": end, "anees": phase.value, "band_95": phase.band_95}
+            for (begin, end), phase in zip(means.phase_spans, means.phases, strict=True)
+        ],
+        # Where one axis is claimed too well and another too badly, the NEES of all three can look right.
+        "axis_nees": _by_axis(means.axis_nees, "value"),
+        "axis_nees_interval_95": _by_axis(means.axis_nees, "interval_95"),
+        "within_two_sigma": _by_axis(means.within_two_sigma, "value"),
+        "within_two_sigma_interval_95": _by_axis(means.within_two_sigma, "interval_95"),
+        **{f"coverage_{_percent(p)}": m.value for p, m in zip(COVERAGE_LEVELS, means.covered, strict=True)},
+        **{
+            f"coverage_{_percent(p)}_interval_95": m.interval_95
+            for p, m in zip(COVERAGE_LEVELS, means.covered, strict=True)
+        },
+    }
+
+
+def share_in_band(nees_per_step: np.ndarray, band: tuple[float, float]) -> dict[str, Any]:
+    """The share of steps (T,) whose mean NEES lies in its 95 % band, and its 95 % interval."""
+    inside = (nees_per_step >= band[0]) & (nees_per_step <= band[1])
+    mean = mean_over_time(inside.astype(float), 0.95, 0.95 * 0.05)  # neighbouring steps are correlated
+    reach = (mean.band_95[1] - mean.band_95[0]) / 2
+    name = "nees_steps_in_band"
+    return {name: mean.value, f"{name}_interval_95": (max(mean.value - reach, 0.0), min(mean.value + reach, 1.0))}
+
+
+def by_component(values: np.ndarray) -> dict[str, float]:
+    """Values (m,) of the components of an innovation, by name: range and bearing, or their numbers."""
+    names = ("range", "bearing") if len(values) == 2 else tuple(map(str, range(len(values))))
+    return dict(zip(names, np.asarray(values).tolist(), strict=True))
+
+
+def _by_axis(means: tuple[Mean, ...], field: str) -> dict[str, Any]:
+    return {axis: getattr(mean, field) for axis, mean in zip(AXES, means, strict=True)}
+
+
+def _percent(level: float) -> int:
+    return round(100 * level)
+
+
+def readable(value: float, digits: int = 3) -> str:
+    """A number for people: so many digits, and never a power of ten where there is room for the number."""
+    return f"{value:,.0f}" if 10**digits <= abs(value) < 1e9 else f"{value:.{digits}g}"
+
+
+def verdict(means: PoseMeans, basis: Basis) -> str:
+    """What the normalised errors of a pose say about its covariance: which way it is off, by how much, when, and
+    what the statement rests on.
+
+    A factor of the covariance is given where the study allows one: without a gate, from a start that is drawn from
+    the prior or beside a reference, and where x, y and yaw are off by the same one within their errors. Elsewhere the
+    axes are named. What an exact start or a gate does by itself is not blamed on the filter.
+    """
+    lost = f"{basis.diverged} of {basis.runs} runs diverged" if basis.diverged else ""
+    if basis.diverged and basis.gate:
+        lost += ", which a gate can bring about by itself: it refuses what would correct them"
+    if not basis.steps and basis.diverged:
+        return _joined("not consistent: no NEES is finite", lost)
+    if not basis.steps or (basis.runs == 1 and basis.steps < _FEW_STEPS):
+        return f"no verdict: {basis.steps} scored steps, at least {_FEW_STEPS} of one run expected"
+    judged, reference = _judged(means), _judged(basis.reference) if basis.reference is not None else None
+    relative = _relative(judged, reference, POSE_DIMENSION)
+    expected = POSE_DIMENSION if reference is None else reference.value
+    low, high = (expected * limit for limit in relative.band_95)
+    others = " of the others" if basis.diverged else ""
+    stated = f"ANEES {readable(judged.value, 4)}{others}"
+    band = f"its 95 % band [{low:.4g}, {high:.4g}]"
+    if reference is not None:
+        band += f" around {readable(expected, 4)}, that of the same filter told the robot's own noise"
+    if basis.runs == 1:
+        band += f", {readable(relative.samples, 2)} independent samples"
+
+    half = (relative.band_95[1] - relative.band_95[0]) / 2
+    short = basis.runs == 1 and relative.samples < _FEW_SAMPLES
+    if short:
+        half *= student_t(relative.samples, 0.998) / student_t(relative.samples)
+    off = abs(relative.value - 1)
+    axes = _wrong_axes(means, basis)
+    if not off > half:
+        if half > _WIDE or short:
+            return _joined(f"undecided: {stated}, {band}: too few to tell", lost)
+        if axes and not _disturbed(basis, axes):
+            return _joined(f"not consistent: {stated} lies in {band}, but {_in_words(axes, basis)}", lost)
+        opening = "not consistent" if lost else "consistent"
+        return _joined(f"{opening}: {stated} lies in {band}", lost)
+    if off <= _TOLERANCE and not lost:
+        return f"consistent within {100 * _TOLERANCE:g} %: {stated}, {band}"
+    cause = _cause(basis, relative.value)
+    if cause and 1 / _LITTLE < relative.value < _LITTLE:
+        return _joined(f"undecided: {stated} lies outside {band}, which {cause} can bring about by itself", lost)
+
+    side = "over-confident" if relative.value > 1 else "under-confident"
+    if len({axis.value > 1 for axis in axes.values()}) > 1:
+        side = "not consistent"
+    if _share_a_factor(means, basis):
+        size = f"covariance {_factor(relative)}" if _has_factor(basis) else f"ANEES {readable(relative.value)} times"
+        size += "" if _has_factor(basis) else f" what is expected, no factor of the covariance {_behind(basis)}"
+    else:
+        size = _in_words(axes, basis) if axes else "the axes alone agree, their correlations do not"
+    judged_by = f"({stated}, {readable(expected)} expected, {band})"
+    return _joined(f"{side}: {size} {judged_by}{_when(means, basis)}", lost)
+
+
+def _judged(means: PoseMeans) -> Mean:
+    """The NEES of the runs that have not diverged, if there are any."""
+    return means.kept_nees if means.kept_nees.samples else means.nees
+
+
+def _has_factor(basis: Basis) -> bool:
+    """Whether the ratio of squared error to variance is what the covariance is wrong by.
+
+    A gate answers a wrong covariance by letting in more or less, so that the errors change too; an exact start makes
+    the first errors small, by as much as in the reference.
+    """
+    return not basis.gate and (not basis.exact_start or basis.reference is not None)
+
+
+def _behind(basis: Basis) -> str:
+    return "behind a gate" if basis.gate else "from an exact start"
+
+
+def _joined(sentence: str, lost: str) -> str:
+    return f"{sentence}; {lost}" if lost else sentence
+
+
+def _relative(mean: Mean, reference: Mean | None, expected: float) -> Mean:
+    """A mean over what is expected of it, so that 1 is right."""
+    if reference is not None:
+        return ratio(mean, reference)
+    low, high = mean.band_95
+    return Mean(mean.value / expected, mean.standard_error / expected, mean.samples, (low / expected, high / expected))
+
+
+def _axes(means: PoseMeans, basis: Basis) -> list[Mean]:
+    reference = basis.reference.axis_nees if basis.reference is not None else (None,) * 3
+    return [_relative(*pair, 1) for pair in zip(means.axis_nees, reference, strict=True)]
+
+
+def _wrong_axes(means: PoseMeans, basis: Basis) -> dict[str, Mean]:
+    """The axes whose variance is off, beyond its errors and by more than a few per cent."""
+
+    def wrong(axis: Mean) -> bool:
+        reach = student_t(axis.samples, _SURE) * axis.standard_error
+        return abs(axis.value - 1) > reach and not 1 / _ALIKE < axis.value < _ALIKE
+
+    return {name: axis for name, axis in zip(AXES, _axes(means, basis), strict=True) if wrong(axis)}
+
+
+def _disturbed(basis: Basis, axes: dict[str, Mean]) -> bool:
+    """Whether an exact start or a gate may be what moves these axes."""
+    small = all(1 / _LITTLE < axis.value < _LITTLE for axis in axes.values())
+    return small and basis.reference is None and (basis.exact_start or basis.gate)
+
+
+def _share_a_factor(means: PoseMeans, basis: Basis) -> bool:
+    axes = _axes(means, basis)
+    for i, one in enumerate(axes):
+        for other in axes[:i]:
+            if not (one.value > 0 and other.value > 0):
+                return False
+            error = math.hypot(one.standard_error / one.value, other.standard_error / other.value)
+            reach = student_t(min(one.samples, other.samples), 0.99) * error
+            if abs(math.log(one.value / other.value)) > max(reach, math.log(_ALIKE)):
+                return False
+    return True
+
+
+def _cause(basis: Basis, relative: float) -> str:
+    """What may move the ANEES this way without any fault of the filter's, where no reference says how far."""
+    if basis.reference is not None:
+        return ""
+    causes = []
+    if basis.exact_start and relative < 1:
+        causes.append("an exact start, of which the prior does not know,")
+    if basis.gate and (relative > 1 or basis.exact_start):
+        causes.append("a gate, which refuses honest observations too,")
+    return " or ".join(causes)
+
+
+def _factor(relative: Mean) -> str:
+    """Size and side of a misfit, with its interval."""
+    low, high = relative.interval_95
+    if relative.value < 1:
+        value, low, high = (1 / x if x > 0 else math.inf for x in (relative.value, high, low))
+        return f"{_digits(value)} [{_digits(low)}, {_digits(high)}] times too large"
+    return f"{_digits(relative.value)} [{_digits(low)}, {_digits(high)}] times too small"
+
+
+def _digits(factor: float) -> str:
+    """Enough of them that a factor beside 1 does not read 1."""
+    return f"{factor:.3f}" if 0.9 < factor < 1.1 else readable(factor)
+
+
+def _in_words(axes: dict[str, Mean], basis: Basis) -> str:
+    """The axes that are off, alike ones together."""
+    if not _has_factor(basis):
+        sizes = ", ".join(f"{name} {readable(axis.value)}" for name, axis in axes.items())
+        return f"error² over σ² of {sizes} times what is expected"
+    return ", ".join(f"the variance of {name} {_factor(axis)}" for name, axis in axes.items())
+
+
+def _when(means: PoseMeans, basis: Basis) -> str:
+    """Which part of the drive is worst, if one stands out."""
+    reference = basis.reference.phases if basis.reference is not None else (None,) * len(means.phases)
+    phases = [_relative(*pair, POSE_DIMENSION) for pair in zip(means.phases, reference, strict=True)]
+    known = [i for i, phase in enumerate(phases) if math.isfinite(phase.value) and phase.value > 0]
+    if len(known) < 2:
+        return ""
+    far = max(known, key=lambda i: abs(math.log(phases[i].value)))
+    near = min(known, key=lambda i: abs(math.log(phases[i].value)))
+    error = math.hypot(phases[far].standard_error, phases[near].standard_error)
+    reach = student_t(min(phases[i].samples for i in (far, near)), 0.99) * error
+    if not abs(phases[far].value - phases[near].value) > max(reach, _WIDE * phases[near].value):
+        return ""
+    begin, end = means.phase_spans[far]
+    return f"; most so from {begin:.4g} to {end:.4g} s: NEES {readable(means.phases[far].value)}"
+
+
+def gate_verdict(
+    accept_rate: float, nominal: float | None, observations: int | None = None, longest_streak: int | None = None
+) -> str:
+    """What the share of observations the gate lets in says.
+
+    Args:
+        accept_rate: share let in. nominal: the gate's probability; None: there is no gate.
+        observations: their number, for an interval of the share (binomial); without it nothing is called significant
+            that is not large.
+        longest_streak: of observations of one run that the gate refused one after the other.
+
+    Returns:
+        A sentence: locked out where a streak takes up a tenth of the observations, or where less than half as many
+        pass as should; too tight or too loose where the interval excludes 1.5 times, or 1 / 1.5 of, the refusals
+        expected.
+    """
+    if nominal is None:
+        return "no gate: every observation is used"
+    if not math.isfinite(accept_rate):
+        return "nothing observed: the gate was never asked"
+    rejected, expected = 1 - accept_rate, 1 - nominal
+    low = high = rejected
+    text = f"the gate rejected {100 * rejected:.3g} % of the observations, {100 * expected:.3g} % expected"
+    if observations:
+        low, high = binomial_interval(round(rejected * observations), observations)
+        interval = f" [{100 * low:.3g}, {100 * high:.3g}] of {observations:,}"
+        text = f"the gate rejected {100 * rejected:.3g} %{interval} observations, {100 * expected:.3g} % expected"
+        if observations < _FEW_STEPS:
+            return text
+    streak = longest_streak or 0
+    stuck = streak >= _STREAK and streak >= 0.1 * (observations or math.inf)
+    if stuck or 1 - low < 0.5 * nominal:
+        streak_words = f", {streak:,} one after the other" if stuck else ""
+        return f"locked out: {text}{streak_words}; the filter is sure of a wrong pose and refuses what would correct it"
+    if low > _GATE_TOLERANCE * expected:
+        return f"too tight: {text}; innovations are larger than the filter believes"
+    if high < expected / _GATE_TOLERANCE:
+        return f"too loose: {text}; innovations are smaller than the filter believes"
+    return text

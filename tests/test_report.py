@@ -1,0 +1,250 @@
+"""Verdicts in words: what they blame, where a factor is given, and what they rest on."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from jaxlocmap import consistency
+from jaxlocmap.consistency import Basis, Mean, PoseMeans
+
+
+def mean(value, error, expected=3.0, runs=300):
+    reach = scipy.stats.t.ppf(0.975, runs - 1) * error
+    return Mean(value, error, runs, (expected - reach, expected + reach))
+
+
+def means(anees=3.0, axes=(1.0, 1.0, 1.0), *, error=0.02, kept=None, phases=None, runs=300):
+    """Statistics of a study whose NEES has a standard error of `error`, each axis a third of it."""
+    ratios = tuple(mean(a, error / 3, 1.0, runs) for a in axes)
+    parts = tuple(mean(p, 2 * error, 3.0, runs) for p in phases or (anees,) * 4)
+    return PoseMeans(
+        nees=mean(anees, error, 3.0, runs),
+        kept_nees=mean(anees if kept is None else kept, error, 3.0, runs),
+        axis_nees=ratios,
+        within_two_sigma=ratios,
+        covered=ratios + ratios[:1],
+        phases=parts,
+        phase_spans=((0.1, 6.0), (6.1, 12.0), (12.1, 18.0), (18.1, 24.0)),
+    )
+
+
+def said(of, *, runs=300, **basis):
+    return consistency.verdict(of, Basis(runs=runs, steps=1000, **basis))
+
+
+def scaled(factor, **rest):
+    """A filter whose covariance is too small by a factor."""
+    return means(3 * factor, (factor,) * 3, **rest)
+
+
+def test_inside_its_band_a_filter_is_consistent():
+    assert said(means(3.02)) == "consistent: ANEES 3.02 lies in its 95 % band [2.961, 3.039]"
+    assert said(means(2.961)).startswith("consistent: ")
+
+
+def test_a_misfit_that_is_significant_and_small_is_named_as_such():
+    text = said(means(3.025, error=0.005))
+    assert text == "consistent within 1 %: ANEES 3.025, its 95 % band [2.99, 3.01]"
+    assert "times" in said(scaled(1.02, error=0.005))
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (4.0, r"over-confident: covariance 4 [3.99, 4.01] times too small (ANEES 12, 3 expected, "),
+        (0.5, r"under-confident: covariance 2 [1.95, 2.05] times too large (ANEES 1.5, 3 expected, "),
+        (1.04, r"over-confident: covariance 1.040 [1.027, 1.053] times too small"),
+    ],
+)
+def test_axes_that_agree_share_a_factor_with_its_interval(factor, words):
+    assert said(scaled(factor)).startswith(words)
+
+
+def test_no_verdict_says_1_times():
+    for factor in np.linspace(0.9, 1.1, 41):
+        assert " 1 times" not in said(scaled(factor, error=1e-4))
+
+
+def test_axes_that_disagree_are_named_each_with_its_own():
+    text = said(means(2.49, (0.51, 0.49, 1.22)))
+    assert text.startswith("not consistent: the variance of x 1.96 [1.91, 2.01] times too large, the variance of y ")
+    assert "the variance of yaw 1.22 [1.21, 1.23] times too small" in text
+    assert "covariance" not in text
+
+
+def test_axes_that_make_up_for_each_other_are_found_out():
+    text = said(means(3.0, (0.6, 1.0, 1.5)))
+    assert text.startswith("not consistent: ANEES 3 lies in its 95 % band")
+    assert "the variance of x 1.67" in text
+    assert "the variance of y " not in text
+
+
+def test_correlations_alone_can_be_wrong():
+    assert "the axes alone agree, their correlations do not" in said(means(4.0)) or "covariance" in said(means(4.0))
+
+
+@pytest.mark.parametrize(
+    ("of", "basis", "cause"),
+    [
+        (scaled(0.94), {"exact_start": True}, "an exact start"),
+        (scaled(1.04), {"gate": True}, "a gate"),
+        (scaled(0.96), {"gate": True, "exact_start": True}, "an exact start"),
+    ],
+)
+def test_what_start_and_gate_do_by_themselves_is_not_blamed_on_the_filter(of, basis, cause):
+    text = said(of, **basis)
+    assert text.startswith("undecided: ANEES")
+    assert cause in text
+    assert "times too" not in text
+
+
+@pytest.mark.parametrize(
+    ("of", "basis", "side"),
+    [
+        (scaled(1.1), {"exact_start": True}, "over-confident"),  # an exact start only lowers
+        (scaled(0.9), {"gate": True}, "under-confident"),  # a gate only raises
+        (scaled(3.0), {"gate": True}, "over-confident"),  # by far more than it can
+        (scaled(0.3), {"exact_start": True}, "under-confident"),
+    ],
+)
+def test_what_they_cannot_do_is_the_filter_s_without_a_factor(of, basis, side):
+    text = said(of, **basis)
+    assert text.startswith(side)
+    assert "no factor of the covariance" in text
+    assert "times too" not in text
+
+
+def test_a_reference_takes_the_place_of_what_is_expected():
+    reference = means(2.8, (0.93, 0.93, 0.94))
+    basis = {"exact_start": True, "reference": reference}
+    assert said(means(2.82, (0.93, 0.94, 0.94)), **basis).startswith(
+        "consistent: ANEES 2.82 lies in its 95 % band [2.744"
+    )
+    text = said(means(5.6, (1.86, 1.86, 1.88)), **basis)  # from an exact start both suffer alike: a factor follows
+    assert text.startswith("over-confident: covariance 2 [1.97, 2.03] times too small")
+    text = said(means(5.6, (1.86, 1.86, 1.88)), **basis, gate=True)
+    assert "no factor of the covariance behind a gate" in text
+    assert "2 times what is expected" in text
+
+
+def test_the_error_of_the_reference_counts():
+    far = means(2.9)
+    assert said(means(3.0), reference=far, exact_start=True).startswith("over-confident")
+    unsure = means(2.9, error=0.1)
+    assert said(means(3.0), reference=unsure, exact_start=True).startswith("consistent")
+
+
+@pytest.mark.parametrize("of", [means(), scaled(2.0), scaled(0.2)])
+def test_diverged_runs_are_in_every_verdict_and_the_others_are_judged(of):
+    text = said(of, diverged=4)
+    assert text.endswith("; 4 of 300 runs diverged")
+    assert "of the others" in text
+    assert not text.startswith("consistent")
+    assert "diverged" not in said(of)
+    assert "which a gate can bring about by itself" in said(of, diverged=4, gate=True)
+
+
+def test_a_lost_run_s_nees_does_not_stand_for_the_others():
+    assert said(means(1e6, kept=3.01), diverged=1).startswith("not consistent: ANEES 3.01 of the others lies in its")
+
+
+def test_the_phase_that_stands_out_is_named():
+    assert said(means(6.0, (2.0,) * 3, phases=(3.0, 3.1, 3.0, 15.0))).endswith("; most so from 18.1 to 24 s: NEES 15")
+    assert "most so" not in said(scaled(2.0))
+
+
+def test_one_run_is_undecided_until_its_samples_tell():
+    few, some, many = (
+        means()._replace(nees=m, kept_nees=m)
+        for m in (
+            Mean(4.0, 0.5, 20.0, (2.0, 4.0)),  # just at its band
+            Mean(4.2, 0.5, 20.0, (2.0, 4.0)),  # beyond it, but the correlation time is uncertain
+            Mean(3.05, 0.1, 500.0, (2.8, 3.2)),
+        )
+    )
+    for of in (few, some):
+        text = said(of, runs=1)
+        assert text.startswith("undecided: ANEES 4")
+        assert "20 independent samples" in text
+    assert said(many, runs=1).startswith("consistent: ")
+    far = means()._replace(kept_nees=Mean(40.0, 5.0, 20.0, (2.0, 4.0)))
+    assert said(far, runs=1).startswith("over-confident")
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3, 19])
+def test_too_little_truth_gives_no_verdict_and_says_how_much_there_is(steps):
+    text = consistency.verdict(means(0.0), Basis(runs=1, steps=steps))
+    assert text == f"no verdict: {steps} scored steps, at least 20 of one run expected"
+
+
+def test_no_finite_nees_is_not_consistent():
+    text = consistency.verdict(means(math.nan), Basis(runs=2, steps=0, diverged=2))
+    assert text == "not consistent: no NEES is finite; 2 of 2 runs diverged"
+
+
+# --- The gate ---
+
+
+@pytest.mark.parametrize(
+    ("rate", "nominal", "begins"),
+    [
+        (0.7, None, "no gate: every observation is used"),
+        (math.nan, 0.99, "nothing observed: the gate was never asked"),
+        (0.3, 0.99, "locked out: the gate rejected 70 % of the observations, 1 % expected"),
+        (0.96, 0.99, "too tight: the gate rejected 4 % of the observations, 1 % expected"),
+        (0.998, 0.99, "too loose: the gate rejected 0.2 % of the observations, 1 % expected"),
+        (0.988, 0.99, "the gate rejected 1.2 % of the observations, 1 % expected"),
+        (0.4, 0.4, "the gate rejected 60 % of the observations, 60 % expected"),
+        (0.1, 0.4, "locked out: the gate rejected 90 % of the observations, 60 % expected"),
+    ],
+)
+def test_the_gate_s_verdict(rate, nominal, begins):
+    assert consistency.gate_verdict(rate, nominal).startswith(begins)
+
+
+@pytest.mark.parametrize(
+    ("rejected", "observations", "word"),
+    [
+        (0, 100, None),  # a good filter shows none in 37 studies of 100
+        (0, 1000, "too loose"),
+        (2, 40, None),
+        (8, 100, "too tight"),
+        (60, 100, "too tight"),  # half of them may be let in
+        (80, 100, "locked out"),
+        (1, 1, None),
+        (29_000, 1_000_000, "too tight"),
+        (11_000, 1_000_000, None),  # significant, and no one need mind
+    ],
+)
+def test_few_observations_do_not_condemn_a_gate_and_many_do(rejected, observations, word):
+    text = consistency.gate_verdict(1 - rejected / observations, 0.99, observations)
+    assert text.startswith(f"{word}: " if word else "the gate rejected")
+    low, high = scipy.stats.binomtest(rejected, observations).proportion_ci(0.95, method="exact")
+    assert f"[{100 * low:.3g}, {100 * high:.3g}] of {observations:,} observations" in text
+
+
+@pytest.mark.parametrize(
+    ("rejected", "streak", "word"),
+    [(500, 500, "locked out"), (150, 150, "locked out"), (500, 20, "locked out"), (300, 30, "too tight")],
+)
+def test_the_longest_streak_tells_a_filter_that_is_locked_out(rejected, streak, word):
+    text = consistency.gate_verdict(1 - rejected / 1000, 0.99, 1000, streak)
+    if (rejected, streak) == (500, 20):
+        assert text.startswith("too tight")  # half of them let in, between the others
+    else:
+        assert text.startswith(f"{word}: ")
+    assert (f"{streak:,} one after the other" in text) == (streak >= 100)
+
+
+def test_a_good_gate_is_condemned_in_at_most_5_studies_of_100():
+    for observations in (10, 50, 200, 1000, 10_000):
+        counts = np.arange(observations + 1)
+        chance = scipy.stats.binom.pmf(counts, observations, 0.01)
+        likely = counts[chance > 1e-12]
+        condemned = [
+            not consistency.gate_verdict(1 - count / observations, 0.99, observations).startswith("the gate")
+            for count in likely
+        ]
+        assert chance[likely][np.array(condemned)].sum() <= 0.05
