@@ -102,7 +102,8 @@ def _errors(ax: Axes, time: np.ndarray, report: dict[str, Any]) -> None:
     position = (np.hypot(*error[:, :2].T), np.hypot(*sigma[:, :2].T), "position", "m", ESTIMATE)
     heading = (error[:, 2], sigma[:, 2], "heading", "rad", "tab:red")
     for measured, claimed, name, unit, colour in (position, heading):
-        ax.plot(time, measured, color=colour, lw=1.2, label=f"{name}: error, RMS over runs [{unit}]")
+        over = "" if report["runs"] == 1 else ", RMS over runs"
+        ax.plot(time, measured, color=colour, lw=1.2, label=f"{name}: error{over} [{unit}]")
         ax.plot(time, claimed, color=colour, ls=":", label=f"{name}: the filter's own σ [{unit}]")
     ax.set(title="How large the errors are, and how large the filter says", xlabel="time [s]", ylabel="[m] or [rad]")
     ax.set_yscale("log")
