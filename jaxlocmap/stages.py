@@ -64,6 +64,7 @@ def correct(
     Raises:
         ValueError: a wrong shape.
     """
+    checks.shapes(mean=(belief.mean, (3,)), cov=(belief.cov, (3, 3)))
     checks.shapes(z=(z, (2,)), landmark=(landmark, (2,)), row=(row, ()), usable=(usable, ()))
     usable = usable & is_measurement(z[0], z[1])
     z = jnp.stack([jnp.where(usable, z[i], 0) for i in range(2)])  # what is no number would spoil derivatives

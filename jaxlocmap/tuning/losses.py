@@ -253,9 +253,9 @@ class Objective:
         of_filter = [name for name in self.names if name != "map"]
         if len(noise) > 2 and of_filter and set(of_filter) <= set(_TWO_EQUATIONS):
             raise ValueError(
-                f"tuned: the loss `{'`, `'.join(of_filter)}` compares a mean and a spread, two equations, which tell no "
-                f"more than two parameters: expected one or two of Q and R, or `pose`, `innovation` or `state` beside "
-                f"it, got {', '.join(noise)}"
+                f"tuned: the loss `{'`, `'.join(of_filter)}` compares a mean and a spread, two equations, which tell "
+                f"no more than two parameters: expected one or two of Q and R, or `pose`, `innovation` or `state` "
+                f"beside it, got {', '.join(noise)}"
             )
 
     def check(self, params: Params, batch: Batch) -> None:
