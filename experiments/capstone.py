@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from common import CONSOLE, command_line, output_folder, saved, show, write_report
 
-from jaxlocmap import consistency, grid, init, plotting, run, simulate
+from jaxlocmap import Inputs, Truth, consistency, grid, init, plotting, run, simulate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,15 +41,24 @@ def course_draws(seed: int, scenario: simulate.Scenario, landmarks: int) -> simu
     return simulate.Draws(*(jnp.asarray(np.array(numbers)) for numbers in (drive, sighting, scan)))
 
 
+def course_drive(seed: int, scenario: simulate.Scenario, world: simulate.World) -> tuple[Truth, Inputs]:
+    """The drive of the course's program, whose detector reports a landmark when what it measures is within its reach,
+    and not, as ours does, when the landmark is. With seed 4 that makes a difference at two of its 133 observations.
+    """
+    draws = course_draws(seed, scenario, len(world.landmarks))
+    everything = dataclasses.replace(scenario, sight_range=math.inf)
+    truth, inputs = simulate.roll_out(draws, world, simulate.Noise(), scenario.prior().mean, scenario=everything)
+    return truth, inputs._replace(valid=inputs.valid & (inputs.z[..., 0] < scenario.sight_range))
+
+
 def main(config: CapstoneConfig) -> dict[str, Any]:
     """Run, write the report and the figures."""
     out = output_folder(config.out)
     with jax.enable_x64(True):
         scenario, world = simulate.CAPSTONE, simulate.room()
         settings = scenario.config(motion="capstone")
-        draws = course_draws(config.seed, scenario, len(world.landmarks))
         prior = scenario.prior()
-        truth, inputs = simulate.roll_out(draws, world, simulate.Noise(), prior.mean, scenario=scenario)
+        truth, inputs = course_drive(config.seed, scenario, world)
         state, info = run(
             simulate.course_params(),
             init(prior, config=settings),

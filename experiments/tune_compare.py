@@ -34,6 +34,7 @@ from jaxlocmap.study import Study, summarise
 
 _CLOSE = 1e-4  # nats: two losses this close are the same, a tenth of what 512 runs leave uncertain
 _LOSSES = ("state", "pose", "innovation", "nees", "nis")
+_TWO = ("w", "range")  # what `nees` and `nis` are tuned by, which tell no more than two
 _SURE = 1 / 3  # of the robot's own deviations: where the second comparison starts
 _STEADY = simulate.LOOP  # whose prior is honest: an exact start would let a filter win that does not look
 
@@ -201,8 +202,10 @@ def _losses(runs: int, judge: Callable[[Params], dict[str, Any]], config: Compar
     with progress_bar("losses", len(losses)) as progress:
         for i, name in enumerate(losses):
             objective = tuning.Objective(settings, ((name, 1.0),))
-            fit = tuning.fit(objective, start, batch, epochs=1 if config.quick else 20)
-            rows.append(_loss_row(f"tuned for `{name}`", fit.params, judge))
+            tuned = _TWO if name in ("nees", "nis") else tuning.NOISE
+            fit = tuning.fit(objective, start, batch, tuned=tuned, epochs=1 if config.quick else 20)
+            words = f"tuned for `{name}`" + (f", {' and '.join(tuned)} alone" if tuned == _TWO else "")
+            rows.append(_loss_row(words, fit.params, judge))
             progress(i + 1)
     return rows
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax.core
@@ -39,6 +40,16 @@ def shape(name: str, value: Any, expected: tuple[int | None, ...]) -> None:
         raise ValueError(f"{name}: expected shape {wanted}, got {got}")
 
 
+def shapes(**arrays: tuple[Any, tuple[int | None, ...]]) -> None:
+    """`shape` of several: `shapes(pose=(pose, (3,)), z=(z, (2,)))`.
+
+    Raises:
+        TypeError, ValueError: as `shape`.
+    """
+    for name, (value, expected) in arrays.items():
+        shape(name, value, expected)
+
+
 def dtype(name: str, value: Any, kind: Any) -> None:
     """Raise unless the dtype of `value` is of a kind, such as `np.floating`.
 
@@ -48,6 +59,36 @@ def dtype(name: str, value: Any, kind: Any) -> None:
     got = jnp.result_type(value)
     if not jnp.issubdtype(got, kind):
         raise TypeError(f"{name}: expected dtype {kind.__name__}, got {got}")
+
+
+_FINEST = 1e-3  # m: what a position must be told apart by
+
+
+def farthest(dtype: Any) -> float:
+    """Below which coordinate, m, numbers of a type lie no more than a millimetre apart: 16,384 m in float32."""
+    return 2.0 ** (math.floor(math.log2(_FINEST / float(jnp.finfo(dtype).eps))) + 1)
+
+
+def resolved(name: str, value: Any, dtype: Any) -> None:
+    """Raise if a type cannot hold coordinates to a millimetre.
+
+    Args:
+        value: m, any shape. dtype: the floating-point type it is, or will be, held in.
+
+    Raises:
+        ValueError: a coordinate at which numbers of that type lie further apart.
+    """
+    if not is_concrete(value):
+        return
+    size = np.abs(np.asarray(value, np.float64))
+    worst = float(np.max(size, initial=0, where=np.isfinite(size)))
+    if worst >= farthest(dtype):
+        spacing = 2.0 ** math.floor(math.log2(worst)) * float(jnp.finfo(dtype).eps)
+        raise ValueError(
+            f"{name}: expected coordinates that {jnp.dtype(dtype).name} holds to {_FINEST:g} m, got {worst:g} m, where "
+            f"its numbers lie {spacing:.2g} m apart: subtract an origin, or use float64 "
+            "(jax.config.update('jax_enable_x64', True))"
+        )
 
 
 def covariance(name: str, value: Any, size: int, *, definite: bool = False) -> None:

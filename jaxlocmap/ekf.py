@@ -78,19 +78,15 @@ def predict(
         mean (3,), cov (3, 3), symmetric. Source: Thrun, Burgard & Fox 2005, section 7.4.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: a wrong shape, also of what the motion model returns.
     """
-    for name, value, shape in (
-        ("mean", mean, (3,)),
-        ("cov", cov, (3, 3)),
-        ("control", control, (2,)),
-        ("Q", Q, (2, 2)),
-    ):
-        checks.shape(name, value, shape)
-    F, G = (Matrix.of(J) for J in motion.jacobians(mean, control, dt))
+    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)), control=(control, (2,)), dt=(dt, ()), Q=(Q, (2, 2)))
+    moved, (F, G) = motion.transition(mean, control, dt), motion.jacobians(mean, control, dt)
+    checks.shapes(transition=(moved, (3,)), F=(F, (3, 3)), G=(G, (3, 2)))
+    F, G = Matrix.of(F), Matrix.of(G)
     ratio = jnp.where(dt > 0, nominal_dt / jnp.where(dt > 0, dt, 1), 0)
     P = sandwich(F, Matrix.symmetric(cov)) + sandwich(G, Matrix.symmetric(Q).scale(ratio))
-    return motion.transition(mean, control, dt), P.array(cov.dtype)
+    return moved, P.array(cov.dtype)
 
 
 def update(
@@ -129,8 +125,8 @@ def update(
     """
     checks.shape("residual", residual, (None,))
     m = len(residual)
-    for name, value, shape in (("mean", mean, (3,)), ("cov", cov, (3, 3)), ("H", H, (m, 3)), ("R", R, (m, m))):
-        checks.shape(name, value, shape)
+    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)), H=(H, (m, 3)), R=(R, (m, m)))
+    checks.shapes(threshold=(threshold, ()), valid=(valid, ()))
     r = tuple(residual[i] for i in range(m))
     P = Matrix.symmetric(cov)
     H, noise = Matrix.of(H), Matrix.symmetric(R)

@@ -45,10 +45,16 @@ def update_log_odds(
         (rows, columns) nats. Source: Elfes 1989; Thrun, Burgard & Fox 2005, section 9.2.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: a wrong shape, or a grid so far out that the pose's dtype cannot hold its corners to a millimetre.
     """
     limits: dict[str, Any] = {"spec": spec, "min_range": min_range, "max_range": max_range}
     return clamp(add_scan(log_odds, pose, ranges, beam_angles, l_occ, l_free, **limits), spec)
+
+
+def corners(spec: GridSpec) -> list[float]:
+    """Least and largest x and y of the grid, m."""
+    (x, y), (rows, columns) = spec.origin, spec.shape
+    return [x, y, x + columns * spec.resolution, y + rows * spec.resolution]
 
 
 def clamp(log_odds: jax.Array, spec: GridSpec) -> jax.Array:
@@ -76,7 +82,8 @@ def add_scan(
 
     Args, source and errors as in `update_log_odds`; cells of `log_odds` may lie below l_min.
     """
-    checks.shape("log_odds", log_odds, spec.shape)
+    checks.shapes(log_odds=(log_odds, spec.shape), l_occ=(l_occ, ()), l_free=(l_free, ()))
+    checks.resolved("grid", corners(spec), jnp.result_type(pose))
 
     def lines(pose: jax.Array, ranges: jax.Array) -> Lines:
         return trace(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
@@ -164,7 +171,11 @@ def entropy_bits(log_odds: jax.Array) -> jax.Array:
 
     Returns:
         () bits; a cell never seen counts one. Source: Cover & Thomas 2006, section 2.1.
+
+    Raises:
+        ValueError: not one map.
     """
+    checks.shape("log_odds", log_odds, (None, None))
     return jnp.sum(_bits(log_odds))
 
 
@@ -230,7 +241,13 @@ class Score(NamedTuple):
 
 
 def score(log_odds: jax.Array, occupied: jax.Array, where: jax.Array, *, bins: int = 10) -> Score:
-    """What `entropy_bits`, `brier` and `calibration` are made of, in one pass over the map; arguments as theirs."""
+    """What `entropy_bits`, `brier` and `calibration` are made of, in one pass over the map; arguments as theirs.
+
+    Raises:
+        ValueError: not one map, or a truth of another shape.
+    """
+    checks.shape("log_odds", log_odds, (None, None))
+    checks.shapes(occupied=(occupied, log_odds.shape), where=(where, log_odds.shape))
     each_bin = jnp.arange(bins, dtype=jnp.int32)[:, None]
 
     def row(L: jax.Array, occupied: jax.Array, where: jax.Array) -> Score:
@@ -270,7 +287,13 @@ def endpoint_covariance(
 
     Returns:
         (2, 2) m². Source: first-order propagation, Smith, Self & Cheeseman 1990.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shapes(pose=(pose, (3,)), cov=(cov, (3, 3)), reach=(reach, ()), angle=(angle, ()))
+    if R is not None:
+        checks.shape("R", R, (2, 2))
     c, s = jnp.cos(pose[2] + angle), jnp.sin(pose[2] + angle)
     one, zero = jnp.ones_like(c), jnp.zeros_like(c)
     J_ray = jnp.stack([jnp.stack([one, zero, -reach * s]), jnp.stack([zero, one, reach * c])])

@@ -19,14 +19,28 @@ Offset = tuple[float, float, float]
 _TOUCHING = 1e-9  # m^2: closer than this, a landmark has no bearing
 
 
-def _sensor(pose: jax.Array, offset: Offset) -> tuple[jax.Array, jax.Array, jax.Array, Matrix]:
-    """Position and heading of the sensor, and their Jacobian by the pose."""
+def sensor_pose(pose: jax.Array, offset: Offset) -> tuple[jax.Array, jax.Array, jax.Array, Matrix]:
+    """Where a sensor stands that is mounted at an offset from the robot's centre.
+
+        s = (x + dx cos(theta) - dy sin(theta), y + dx sin(theta) + dy cos(theta), theta + dtheta)
+
+    Args:
+        pose: (3,) m, m, rad. offset: (dx, dy, dtheta) m, m, rad in the body frame.
+
+    Returns:
+        x, y (), m; heading (), rad, not wrapped; 3x3 `Matrix`, ds / dpose.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shape("pose", pose, (3,))
     dx, dy, dtheta = offset
+    heading = pose[2] + dtheta if dtheta else pose[2]
     if dx == 0 and dy == 0:
-        return pose[0], pose[1], pose[2] + dtheta, Matrix.identity(3)
+        return pose[0], pose[1], heading, Matrix.identity(3)
     s, c = sin_cos(pose[2])
     right, up = dx * c - dy * s, dx * s + dy * c
-    return pose[0] + right, pose[1] + up, pose[2] + dtheta, Matrix([[1, 0, -up], [0, 1, right], [0, 0, 1]])
+    return pose[0] + right, pose[1] + up, heading, Matrix([[1, 0, -up], [0, 1, right], [0, 0, 1]])
 
 
 def observe(pose: jax.Array, landmark: jax.Array, sensor_offset: Offset = (0.0, 0.0, 0.0)) -> jax.Array:
@@ -41,8 +55,12 @@ def observe(pose: jax.Array, landmark: jax.Array, sensor_offset: Offset = (0.0, 
     Returns:
         (2,) range m, bearing rad wrapped; no gradient where the landmark lies on the sensor.
         Source: Thrun, Burgard & Fox 2005, section 6.6.
+
+    Raises:
+        ValueError: a wrong shape.
     """
-    x, y, heading, _ = _sensor(pose, sensor_offset)
+    checks.shape("landmark", landmark, (2,))
+    x, y, heading, _ = sensor_pose(pose, sensor_offset)
     dx, dy = landmark[0] - x, landmark[1] - y
     return jnp.stack([jnp.hypot(dx, dy), wrap(arctan2(dy, dx) - heading)])
 
@@ -64,9 +82,8 @@ def linearise(
     Raises:
         ValueError: a wrong shape.
     """
-    for name, value, shape in (("pose", pose, (3,)), ("landmark", landmark, (2,)), ("z", z, (2,))):
-        checks.shape(name, value, shape)
-    x, y, heading, J = _sensor(pose, sensor_offset)
+    checks.shapes(landmark=(landmark, (2,)), z=(z, (2,)))
+    x, y, heading, J = sensor_pose(pose, sensor_offset)
     dx, dy = landmark[0] - x, landmark[1] - y
     q = dx * dx + dy * dy
     defined = q > _TOUCHING
@@ -102,9 +119,7 @@ def associate(
     Raises:
         ValueError: a wrong shape, or no landmark.
     """
-    for name, value, shape in (("mean", mean, (3,)), ("cov", cov, (3, 3)), ("R", R, (2, 2))):
-        checks.shape(name, value, shape)
-    checks.shape("landmarks", landmarks, (None, 2))
+    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)), z=(z, (2,)), landmarks=(landmarks, (None, 2)), R=(R, (2, 2)))
     if not len(landmarks):
         raise ValueError("landmarks: expected at least one to choose from, got (0, 2)")
     P, noise = Matrix.symmetric(cov), Matrix.symmetric(R)

@@ -12,12 +12,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxlocmap import checks
 from jaxlocmap.linalg import Matrix
 from jaxlocmap.trig import sin_cos
 
 
 class MotionModel(NamedTuple):
-    """How a control moves a pose. Two functions, so a model is hashable and static under jit."""
+    """How a control moves a pose. Two functions, so a model is hashable and static under jit.
+
+    Those of this module raise ValueError for anything but one pose, control and step length; a batch is a `vmap`.
+    """
 
     transition: Callable[..., Any]  # (pose (3,), control (2,), dt) -> pose (3,), heading wrapped
     jacobians: Callable[..., Any]  # same arguments -> F = df/dpose (3, 3), G = df/dcontrol (3, 2)
@@ -44,12 +48,18 @@ def _moved(pose: jax.Array, dx: jax.Array, dy: jax.Array, turn: jax.Array) -> ja
     return jnp.stack([pose[0] + dx, pose[1] + dy, wrap(pose[2] + turn)])
 
 
+def _check(pose: jax.Array, control: jax.Array, dt: jax.Array) -> None:
+    checks.shapes(pose=(pose, (3,)), control=(control, (2,)), dt=(dt, ()))
+
+
 def _euler_transition(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.Array:
+    _check(pose, control, dt)
     step, (sin, cos) = control[0] * dt, sin_cos(pose[2])
     return _moved(pose, step * cos, step * sin, control[1] * dt)
 
 
 def _euler_jacobians(pose: jax.Array, control: jax.Array, dt: jax.Array) -> tuple[Matrix, Matrix]:
+    _check(pose, control, dt)
     s, c = sin_cos(pose[2])
     step = control[0] * dt
     F = Matrix([[1, 0, -step * s], [0, 1, step * c], [0, 0, 1]])
@@ -58,6 +68,7 @@ def _euler_jacobians(pose: jax.Array, control: jax.Array, dt: jax.Array) -> tupl
 
 
 def _arc_transition(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.Array:
+    _check(pose, control, dt)
     half = 0.5 * control[1] * dt
     chord = control[0] * dt * _sinc(half)[0]
     sin, cos = sin_cos(pose[2] + half)
@@ -65,6 +76,7 @@ def _arc_transition(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.A
 
 
 def _arc_jacobians(pose: jax.Array, control: jax.Array, dt: jax.Array) -> tuple[Matrix, Matrix]:
+    _check(pose, control, dt)
     v, half = control[0], 0.5 * control[1] * dt
     s, slope = _sinc(half)
     sin, cos = sin_cos(pose[2] + half)
@@ -100,8 +112,18 @@ def from_transition(transition: Callable[..., jax.Array]) -> MotionModel:
     Args:
         transition: `(pose (3,) m, m, rad; control (2,) m/s, rad/s; dt () s) -> pose (3,)`, differentiable, heading
             wrapped with `motion.wrap`. Make the model once and keep it: a new one is a new program to compile.
+
+    Returns:
+        A model that raises ValueError where an argument, or what the transition makes of them, is of another shape.
     """
-    return MotionModel(transition, jax.jacfwd(transition, argnums=(0, 1)))
+
+    def checked(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.Array:
+        _check(pose, control, dt)
+        moved = transition(pose, control, dt)
+        checks.shape("transition(pose, control, dt)", moved, (3,))
+        return moved
+
+    return MotionModel(checked, jax.jacfwd(checked, argnums=(0, 1)))
 
 
 def resolve(model: str | MotionModel) -> MotionModel:
@@ -141,9 +163,11 @@ def to_wheels(control: jax.Array, wheel_base: float) -> tuple[jax.Array, jax.Arr
     """Wheel speeds (left, right), m/s, of a control (..., 2): v ∓ omega wheel_base / 2. Inverse of `from_wheels`.
 
     Raises:
-        ValueError: `wheel_base` not positive.
+        ValueError: `wheel_base` not positive, or a last axis that is not (v, omega).
     """
     _require_base(wheel_base)
+    if control.shape[-1:] != (2,):
+        raise ValueError(f"control: expected shape (..., 2), got {control.shape}")
     v, swing = control[..., 0], control[..., 1] * (wheel_base / 2)
     return v - swing, v + swing
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxlocmap import checks, grid
 from jaxlocmap import landmarks as sensor
 from jaxlocmap.batching import any_in_batch, cond, scan, zero_like_any
-from jaxlocmap.stages import Sighting, correct, map_scan, map_spec, predict, sound
+from jaxlocmap.stages import Sighting, correct, is_measurement, map_scan, map_spec, predict, sound
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
 
 
@@ -28,8 +28,9 @@ def init(prior: Gaussian, *, config: Config) -> State:
         config: `config.grid` None leaves out the map.
 
     Raises:
-        ValueError: wrong shapes, or, when they can be looked at, a mean that is not finite or a covariance that is
-            not positive semi-definite.
+        ValueError: wrong shapes; a grid so far out that the dtype cannot hold its corners to a millimetre; or, when
+            they can be looked at, a mean that is not finite or as far out, or a covariance that is not positive
+            semi-definite.
         TypeError: a prior that is not floating point.
     """
     mean, cov = (jnp.asarray(x) for x in prior)
@@ -38,7 +39,10 @@ def init(prior: Gaussian, *, config: Config) -> State:
         checks.dtype(f"prior.{name}", value, np.floating)
     if checks.is_concrete(mean) and not np.all(np.isfinite(mean)):
         raise ValueError(f"prior.mean: expected finite x, y, theta, got {mean.tolist()}")
+    checks.resolved("prior.mean", mean[:2], mean.dtype)
     checks.covariance("prior.cov", cov, 3)
+    if config.grid is not None:
+        checks.resolved("config.grid", grid.corners(config.grid), mean.dtype)
     return State(
         belief=Gaussian(mean, cov.astype(mean.dtype)),
         log_odds=None if config.grid is None else jnp.zeros(config.grid.shape, mean.dtype),
@@ -66,11 +70,13 @@ def step(
     Returns:
         The next state, and what the step reports. `Info.ok` is False where a control is not finite (the robot is
         then taken to stand still, its covariance growing by Q), a step length is not finite or negative (a nominal
-        step is taken, without the control), an observation is not finite or cannot be used (it is left out), or the
-        covariance has broken down.
+        step is taken, without the control), an observation is not finite, has a range that is not above zero or cannot
+        be used (it is left out), the covariance has broken down, or the pose is so far out that its dtype cannot hold
+        it to a millimetre.
 
     Raises:
-        ValueError: shapes that do not fit, an unknown motion model, a grid in `config` but none in `state`.
+        ValueError: shapes that do not fit, an unknown motion model, a grid in `config` but none in `state`, or a
+            landmark, when it can be looked at, so far out that the state's dtype cannot hold it to a millimetre.
         TypeError: landmark ids that are not integers, a `valid` that is not boolean.
     """
     state, info = advance(params, state, inputs, landmarks=landmarks, beam_angles=beam_angles, config=config)
@@ -89,7 +95,7 @@ def advance(
     """`step` inside a loop: the same, but cells of the map may stay below l_min until `settle`, which any number of
     steps can share (`grid.add_scan` says why that changes nothing).
     """
-    _check_step(params, inputs, landmarks, beam_angles, config)
+    _check_step(params, state, inputs, landmarks, beam_angles, config)
     if config.grid is not None and state.log_odds is None:
         raise ValueError("state.log_odds: expected a map, as init makes with this config, got None")
     dtype = state.belief.mean.dtype  # pinned in init: a carry must not change dtype
@@ -188,10 +194,12 @@ def map_scans(
         (rows, columns) nats; the same as `run` makes at the same poses.
 
     Raises:
-        ValueError: no grid in `config`, shapes that do not fit, or parameters that `Params.check` refuses.
+        ValueError: no grid in `config`, shapes that do not fit, parameters that `Params.check` refuses, or a grid or,
+            when it can be looked at, a pose so far out that the poses' dtype cannot hold it to a millimetre.
     """
     params.check()
     checks.shape("poses", poses, (None, 3))
+    checks.resolved("poses", poses[:, :2], jnp.result_type(poses))
     checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
 
     zero = zero_like_any(params, log_odds, poses, ranges, beam_angles)
@@ -223,7 +231,7 @@ def _correct_landmarks(
     )
     if landmarks is None or slots == 0:
         return belief, empty, jnp.array(True)
-    usable = inputs.valid & jnp.all(jnp.isfinite(inputs.z), axis=-1) & (inputs.landmark < len(landmarks))
+    usable = inputs.valid & is_measurement(inputs.z[:, 0], inputs.z[:, 1]) & (inputs.landmark < len(landmarks))
 
     def associate(belief: Gaussian, z: jax.Array, landmark: jax.Array) -> jax.Array:
         best = sensor.associate(*belief, z, landmarks, params.R, config.sensor_offset)
@@ -250,13 +258,20 @@ def _correct_landmarks(
 
 def _check_step(
     params: Params,
+    state: State,
     inputs: Inputs,
     landmarks: jax.Array | None,
     beam_angles: jax.Array | None,
     config: Config,
 ) -> None:
-    for name, value, size in (("params.Q", params.Q, 2), ("params.R", params.R, 2)):
-        checks.shape(name, value, (size, size))
+    for name, value, shape in (
+        ("params.Q", params.Q, (2, 2)),
+        ("params.R", params.R, (2, 2)),
+        ("state.belief.mean", state.belief.mean, (3,)),
+        ("state.belief.cov", state.belief.cov, (3, 3)),
+        ("state.log_likelihood", state.log_likelihood, ()),
+    ):
+        checks.shape(name, value, shape)
     checks.shape("inputs.dt", inputs.dt, ())
     checks.shape("inputs.control", inputs.control, (2,))
     checks.shape("inputs.valid", inputs.valid, (None,))
@@ -272,6 +287,7 @@ def _check_step(
             raise ValueError(f"landmarks: expected (L, 2) for the {slots} observation slots, got None")
         checks.shape("landmarks", landmarks, (None, 2))
         checks.dtype("landmarks", landmarks, np.floating)
+        checks.resolved("landmarks", landmarks, state.belief.mean.dtype)
         if not len(landmarks):
             raise ValueError(f"landmarks: expected at least one for the {slots} observation slots, got (0, 2)")
     if config.grid is not None and inputs.ranges is not None:

@@ -16,11 +16,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import batching
+from jaxlocmap import batching, checks
+from jaxlocmap.landmarks import sensor_pose
 from jaxlocmap.motion import wrap
 from jaxlocmap.normals import Words, normals, uniforms, words_of
 from jaxlocmap.trig import arctan2, sin_cos
-from jaxlocmap.types import Config, Gaussian, GridSpec, Inputs, Params, Truth
+from jaxlocmap.types import Config, Gaussian, GridSpec, Inputs, Params, Truth, check_offset, freeze_tuples
 from jaxlocmap.world import World, occupancy, ray_cast, room  # noqa: F401 (a simulation needs its world too)
 
 
@@ -52,7 +53,12 @@ _COURSE_GRID = GridSpec(origin=(0.0, 0.0), resolution=0.2, shape=(120, 120))
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """A drive and the sensors on board. Frozen and hashable, so static under jit."""
+    """A drive and the sensors on board. Frozen and hashable, so static under jit.
+
+    Raises:
+        ValueError: no steps, looks or beams, or a place of the detector that is none.
+        TypeError: a place that is no tuple of numbers.
+    """
 
     name: str
     steps: int
@@ -60,7 +66,7 @@ class Scenario:
     start: tuple[float, float, float]  # m, m, rad: mean of the prior
     prior_std: tuple[float, float, float] = (0.05**0.5, 0.05**0.5, 0.02**0.5)  # m, m, rad
     dt: float = 0.1  # s
-    sight_range: float = 7.5  # m: the detector reports landmarks whose measured range is below
+    sight_range: float = 7.5  # m: the detector reports landmarks nearer than this
     sight_period: int = 5  # steps between two looks of the detector, the first at step 0
     beams: int = 61
     half_view: float = 1.2  # rad: beams from -half_view to half_view
@@ -69,8 +75,11 @@ class Scenario:
     grid: GridSpec = _COURSE_GRID
     outliers: bool = False  # some sightings are false: at any range within reach, in any direction
     exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
+    sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad: landmark detector in the body frame
 
     def __post_init__(self) -> None:
+        freeze_tuples(self, "sensor_offset")
+        check_offset(self.sensor_offset)
         for name in ("steps", "sight_period", "beams"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Scenario.{name}: expected at least 1, got {getattr(self, name)}")
@@ -93,6 +102,7 @@ class Scenario:
             dt=self.dt,
             motion=motion,
             gate_probability=gate_probability,
+            sensor_offset=self.sensor_offset,
             grid=self.grid if grid else None,
             min_range=self.min_range,
             max_range=self.max_range,
@@ -151,7 +161,11 @@ def draw_pose(key: jax.Array, prior: Gaussian) -> jax.Array:
     """A true pose (3,), m, m, rad, from the prior, so that the prior is honest.
 
     To start exactly where the filter believes, use `prior.mean`.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shapes(mean=(prior.mean, (3,)), cov=(prior.cov, (3, 3)))
     variance, axes = jnp.linalg.eigh(prior.cov)  # unlike Cholesky, content with a variance of zero
     spread = jnp.sqrt(jnp.maximum(variance, 0)) * jax.random.normal(key, (3,), prior.mean.dtype)
     pose = prior.mean + axes @ spread
@@ -176,7 +190,12 @@ def drive(
 
     Returns:
         The true pose (3,), and the commanded control with noise (2,), as the robot measures it.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shapes(draws=(draws, (3,)), k=(k, ()), pose=(pose, (3,)))
+    _check_noise(noise)
     v, w = scenario.command(k, pose)
     sin, cos = sin_cos(pose[2])
     moved = [
@@ -201,23 +220,39 @@ def sight(
 ) -> tuple[jax.Array, jax.Array]:
     """What the detector makes of a landmark.
 
+    Whether it reports one is decided by the true distance: a cut of what it measures would let through more of the
+    readings that came out short, and noise so picked is no longer the noise that it has.
+
     Args:
         draws: (2,) standard normals for range and bearing; with `scenario.outliers` (5,), then uniform over (0, 1):
             whether the sighting is false, and of what range and bearing.
         pose: (3,) m, m, rad, the true one. landmark: (2,) m. noise: as its fields say. scenario: static.
 
     Returns:
-        Range and bearing (2,) m, rad, and whether the detector reports them, which it does below `sight_range`.
+        Range and bearing (2,) m, rad, and whether the detector reports them, which it does of landmarks nearer than
+        `sight_range`. Within a few deviations of a landmark noise can make the range negative; the filter then leaves
+        it out.
+
+    Raises:
+        ValueError: a wrong shape.
     """
-    dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
-    reach = jnp.sqrt(dx * dx + dy * dy) + noise.range * draws[0]
-    bearing = arctan2(dy, dx) - pose[2] + noise.bearing * draws[1]
-    near = reach < scenario.sight_range
+    checks.shapes(draws=(draws, (5 if scenario.outliers else 2,)), landmark=(landmark, (2,)))
+    _check_noise(noise)
+    x, y, heading, _ = sensor_pose(pose, scenario.sensor_offset)
+    dx, dy = landmark[0] - x, landmark[1] - y
+    distance = jnp.sqrt(dx * dx + dy * dy)
+    near = distance < scenario.sight_range
+    reach = distance + noise.range * draws[0]
+    bearing = arctan2(dy, dx) - heading + noise.bearing * draws[1]
     if scenario.outliers:  # of what it reports, so that the rate is the share
         false = draws[2] < noise.outlier_rate
         reach = jnp.where(false, draws[3] * scenario.sight_range, reach)
         bearing = jnp.where(false, (2 * draws[4] - 1) * jnp.pi, bearing)
     return jnp.stack([reach, wrap(bearing)]), near
+
+
+def _check_noise(noise: Noise) -> None:
+    checks.shapes(**{f"noise.{name}": (value, ()) for name, value in noise._asdict().items()})
 
 
 def draw_scan(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
@@ -230,7 +265,12 @@ def look_round(draws: jax.Array, pose: jax.Array, world: World, noise: Noise, *,
 
     Args:
         draws: (B,) standard normals. pose: (3,) m, m, rad, the true one. world, noise: as their fields say.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shape("draws", draws, (scenario.beams,))
+    _check_noise(noise)
     angles = scenario.beam_angles().astype(pose.dtype)
     exact = ray_cast(pose, angles, world.segments, scenario.max_range)
     return jnp.maximum(exact + draws * noise.scan, scenario.min_range)
@@ -256,7 +296,11 @@ def simulate(
     Returns:
         The true poses and what the robot measured, both with a leading axis T: the control with noise; every
         `sight_period` steps, landmarks in reach, slot j holding landmark j; a scan a step.
+
+    Raises:
+        ValueError: a wrong shape; a batch of drives is a `vmap`.
     """
+    checks.shapes(start=(start, (3,)), landmarks=(world.landmarks, (None, 2)))
     words, dtype, landmarks = words_of(key), start.dtype, jnp.arange(len(world.landmarks))
 
     def numbers(k: jax.Array) -> Draws:
@@ -270,7 +314,13 @@ def simulate(
 
 
 def roll_out(draws: Draws, world: World, noise: Noise, start: jax.Array, *, scenario: Scenario) -> tuple[Truth, Inputs]:
-    """`simulate` with given random numbers."""
+    """`simulate` with given random numbers.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shapes(start=(start, (3,)), landmarks=(world.landmarks, (None, 2)))
+    checks.shape("draws.drive", draws.drive, (scenario.steps, 3))
 
     def body(pose: jax.Array, now: tuple[jax.Array, Draws]) -> tuple[jax.Array, tuple[Truth, Inputs]]:
         k, draws = now

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap import ekf, grid
+from jaxlocmap import checks, ekf, grid
 from jaxlocmap import landmarks as sensor
 from jaxlocmap.linalg import Matrix, is_psd, stack
 from jaxlocmap.motion import resolve
@@ -19,7 +19,11 @@ def predict(
 ) -> tuple[Gaussian, jax.Array]:
     """The moved belief, and whether control and step length were usable. Without a control the robot is taken to
     stand still, with a belief that grows by Q all the same; without a step length, for a nominal step.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shapes(control=(control, (2,)), dt=(dt, ()))
     timed = jnp.isfinite(dt) & (dt >= 0)
     usable = jnp.isfinite(control[0]) & jnp.isfinite(control[1]) & timed
     mean, cov = ekf.predict(
@@ -55,9 +59,14 @@ def correct(
     config: Config,
 ) -> tuple[Gaussian, Sighting, jax.Array]:
     """The belief after one observation z (2,) of the landmark (2,) in a row of the list, what is reported of it (all
-    zero, row -1, if it was not used), and whether it was used.
+    zero, row -1, if it was not used), and whether it was used. A range that is not above zero is no measurement.
+
+    Raises:
+        ValueError: a wrong shape.
     """
-    usable = usable & jnp.isfinite(z[0]) & jnp.isfinite(z[1])
+    checks.shapes(mean=(belief.mean, (3,)), cov=(belief.cov, (3, 3)))
+    checks.shapes(z=(z, (2,)), landmark=(landmark, (2,)), row=(row, ()), usable=(usable, ()))
+    usable = usable & is_measurement(z[0], z[1])
     z = jnp.stack([jnp.where(usable, z[i], 0) for i in range(2)])  # what is no number would spoil derivatives
     residual, H, defined = sensor.linearise(belief.mean, landmark, z, config.sensor_offset)
     used = usable & defined
@@ -80,6 +89,11 @@ def correct(
     return Gaussian(update.mean, update.cov), report, used & jnp.isfinite(update.nis)
 
 
+def is_measurement(reach: jax.Array, bearing: jax.Array) -> jax.Array:
+    """Whether a range, m, and a bearing, rad, can have been measured: finite, and the range above zero. Any shape."""
+    return (reach > 0) & jnp.isfinite(reach + bearing)
+
+
 def map_scan(
     params: Params, log_odds: jax.Array, pose: jax.Array, ranges: jax.Array, beam_angles: jax.Array, *, config: Config
 ) -> jax.Array:
@@ -98,9 +112,16 @@ def map_scan(
 
 
 def sound(belief: Gaussian) -> jax.Array:
-    """Whether a belief is finite and its covariance positive semi-definite."""
+    """Whether a belief is finite, its covariance positive semi-definite, and its place one that its dtype can hold to a
+    millimetre.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
     mean, cov = belief
-    return is_psd(Matrix.of(cov)) & jnp.isfinite(mean[0] + mean[1] + mean[2])
+    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)))
+    far = checks.farthest(mean.dtype)
+    return is_psd(Matrix.of(cov)) & (jnp.abs(mean[0]) < far) & (jnp.abs(mean[1]) < far) & jnp.isfinite(mean[2])
 
 
 def map_spec(config: Config) -> GridSpec:

@@ -127,7 +127,7 @@ class GridSpec:
     l_max: float = 4.0  # nats
 
     def __post_init__(self) -> None:
-        _freeze_tuples(self, "origin", "shape")
+        freeze_tuples(self, "origin", "shape")
         for name in ("resolution", "l_min", "l_max"):
             checks.number(name, getattr(self, name))
         if len(self.shape) != 2 or min(self.shape) < 1 or any(int(n) != n for n in self.shape):
@@ -159,7 +159,7 @@ class Config:
     max_range: float = 8.0  # m: a range at or above clears cells up to here and marks none
 
     def __post_init__(self) -> None:
-        _freeze_tuples(self, "sensor_offset")
+        freeze_tuples(self, "sensor_offset")
         for name in ("dt", "gate_softness", "min_range", "max_range"):
             checks.number(name, getattr(self, name))
         gate = None if isinstance(self.gate_probability, jax.Array) else self.gate_probability
@@ -174,15 +174,24 @@ class Config:
             )
         if not 0 <= self.gate_softness < math.inf:
             raise ValueError(f"gate_softness: expected a finite width >= 0, got {self.gate_softness}")
-        if len(self.sensor_offset) != 3 or not all(math.isfinite(c) for c in self.sensor_offset):
-            raise ValueError(f"sensor_offset: expected finite (dx, dy, dtheta), got {self.sensor_offset}")
+        check_offset(self.sensor_offset)
         if not 0 <= self.min_range < self.max_range < math.inf:
             raise ValueError(
                 f"min_range, max_range: expected 0 <= min_range < max_range, got {self.min_range}, {self.max_range}"
             )
 
 
-def _freeze_tuples(record: Any, *names: str) -> None:
+def check_offset(offset: tuple[float, ...]) -> None:
+    """Raise unless this is where a sensor can sit.
+
+    Raises:
+        ValueError: not three finite numbers.
+    """
+    if len(offset) != 3 or not all(math.isfinite(c) for c in offset):
+        raise ValueError(f"sensor_offset: expected finite (dx, dy, dtheta), got {offset}")
+
+
+def freeze_tuples(record: Any, *names: str) -> None:
     """Lists and arrays become tuples, so that the record can be hashed."""
     for name in names:
         value = getattr(record, name)
@@ -202,7 +211,7 @@ class Inputs(NamedTuple):
     dt: jax.Array  # (T,) s, >= 0
     control: jax.Array  # (T, 2) v m/s, omega rad/s
     landmark: jax.Array  # (T, M) int32: row of `landmarks`, -1 (or any below 0) for unknown
-    z: jax.Array  # (T, M, 2) range m, bearing rad
+    z: jax.Array  # (T, M, 2) range m, > 0, bearing rad
     valid: jax.Array  # (T, M) bool: the slot holds an observation
     ranges: jax.Array | None = None  # (T, B) m; None without a scanner
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxlocmap import checks
 from jaxlocmap.batching import zero_like_any
 from jaxlocmap.trig import sin_cos
 from jaxlocmap.types import GridSpec
@@ -56,7 +57,12 @@ def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_r
 
     Returns:
         (B,) m.
+
+    Raises:
+        ValueError: a wrong shape.
     """
+    checks.shapes(pose=(pose, (3,)), beam_angles=(beam_angles, (None,)), segments=(segments, (None, 2, 2)))
+    checks.shape("max_range", max_range, ())
     sin, cos = sin_cos(pose[2])
     table_cos, table_sin = jnp.cos(beam_angles), jnp.sin(beam_angles)
     dx, dy = cos * table_cos - sin * table_sin, sin * table_cos + cos * table_sin
@@ -83,7 +89,11 @@ def occupancy(world: World, spec: GridSpec) -> jax.Array:
 
     Returns:
         (rows, columns) bool.
+
+    Raises:
+        ValueError: walls of a wrong shape.
     """
+    checks.shape("world.segments", world.segments, (None, 2, 2))
     rows, columns = spec.shape
     dtype = world.segments.dtype
     reach = spec.resolution * 1e-3  # a wall on the edge must not depend on rounding

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -244,10 +245,60 @@ def test_an_update_of_the_wrong_shape_is_refused_by_name(change, message):
         ekf.update(**{name: jnp.array(value) for name, value in whole.items()})
 
 
-def test_a_prediction_of_the_wrong_shape_is_refused_by_name():
-    arrays = [jnp.array(x) for x in (MEAN, COV, np.zeros(3))]
-    with pytest.raises(ValueError, match=r"control: expected shape \(2\), got \(3,\)"):
-        ekf.predict(*arrays, jnp.array(0.1), jnp.array(Q), motion=motion.EULER, nominal_dt=0.1)
+def test_a_threshold_or_a_flag_for_many_observations_is_refused_by_name():
+    one = [jnp.array(x) for x in (MEAN, COV, np.zeros(2), np.eye(2, 3), R)]
+    for name, value in (("threshold", jnp.ones(1)), ("valid", jnp.ones(3, bool))):
+        with pytest.raises(ValueError, match=rf"^{name}: expected shape \(\), got \({len(value)},\)$"):
+            ekf.update(*one, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("mean", (4,)),
+        ("mean", (5, 3)),
+        ("cov", (5, 3, 3)),
+        ("control", (3,)),
+        ("control", (5, 2)),
+        ("dt", (1,)),
+        ("Q", (3, 3)),
+    ],
+)
+def test_a_prediction_of_the_wrong_shape_is_refused_by_name(name, wrong):
+    whole = {"mean": MEAN, "cov": COV, "control": np.zeros(2), "dt": np.array(0.1), "Q": Q} | {name: np.ones(wrong)}
+    with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got {re.escape(str(wrong))}$"):
+        ekf.predict(**{key: jnp.array(x) for key, x in whole.items()}, motion=motion.EULER, nominal_dt=0.1)
+
+
+@pytest.mark.parametrize("name", ["transition", "F", "G"])
+def test_a_motion_model_that_returns_something_else_is_refused_by_name(name):
+    made = {"transition": (3,), "F": (3, 3), "G": (3, 2)} | {name: (2, 3)}
+    own = motion.MotionModel(
+        lambda *_: jnp.ones(made["transition"]), lambda *_: (jnp.ones(made["F"]), jnp.ones(made["G"]))
+    )
+    arrays = [jnp.array(x) for x in (MEAN, COV, np.zeros(2), 0.1, Q)]
+    with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got \(2, 3\)$"):
+        ekf.predict(*arrays, motion=own, nominal_dt=0.1)
+
+
+@pytest.mark.parametrize("residual", [(0.05, 0.01), (0.9, -0.2), (40.0, 1.0)])
+def test_a_soft_gate_is_an_update_with_r_over_w(residual, tolerance):
+    """w = 1 / (1 + exp((d² - threshold) / softness)), and no smaller than 1e-6; what is reported is of R itself."""
+    threshold, softness, H = 9.21, 2.0, np.array([[-0.8, -0.6, 0.0], [0.12, -0.16, -1.0]])
+    args = [jnp.array(x) for x in (MEAN, COV, residual, H)]
+    got = ekf.update(*args, jnp.array(R), threshold=threshold, softness=softness)
+    S = H @ COV @ H.T + R
+    nis = np.array(residual) @ np.linalg.solve(S, residual)
+    weight = max(1 / (1 + math.exp(min((nis - threshold) / softness, 700))), 1e-6)
+    loose = np.asarray(R) / weight
+    K = COV @ H.T @ np.linalg.inv(H @ COV @ H.T + loose)
+    A = np.eye(3) - K @ H
+    error = got.mean - (MEAN + K @ residual)
+    np.testing.assert_allclose(error.at[2].set(motion.wrap(error[2])), 0, rtol=0, atol=tolerance(1e-12, 1e-5))
+    np.testing.assert_allclose(got.cov, A @ COV @ A.T + K @ loose @ K.T, rtol=0, atol=tolerance(1e-13, 1e-6))
+    np.testing.assert_allclose(got.S, S, rtol=tolerance(1e-12, 1e-5))
+    np.testing.assert_allclose(got.nis, nis, rtol=tolerance(1e-10, 1e-3))
+    assert bool(got.accepted) == (nis < threshold)
 
 
 # --- course problem 2: a Joseph update of a positive semi-definite matrix is one

@@ -3,6 +3,7 @@
 import functools
 import itertools
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -525,14 +526,53 @@ def test_walls_turn_fuzzier_with_reach():
         ({"pose": (4,)}, r"pose: expected shape \(3\), got \(4,\)"),
         ({"ranges": (3,)}, r"ranges: expected shape \(2\), got \(3,\)"),
         ({"beam_angles": (2, 1)}, r"beam_angles: expected shape \(any\), got \(2, 1\)"),
+        ({"log_odds": (5, 4, 4)}, r"log_odds: expected shape \(4, 4\), got \(5, 4, 4\)"),
+        ({"l_occ": (2,)}, r"l_occ: expected shape \(\), got \(2,\)"),
+        ({"l_free": (1,)}, r"l_free: expected shape \(\), got \(1,\)"),
     ],
 )
 def test_an_update_of_the_wrong_shape_is_refused_by_name(change, message):
     """A map of another shape than the grid's would be written outside its bounds."""
-    shapes = {"log_odds": (4, 4), "pose": (3,), "ranges": (2,), "beam_angles": (2,)} | change
+    shapes = {"log_odds": (4, 4), "pose": (3,), "ranges": (2,), "beam_angles": (2,), "l_occ": (), "l_free": ()} | change
     arrays = {name: jnp.ones(shape) for name, shape in shapes.items()}
     spec = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(4, 4))
     with pytest.raises(ValueError, match=message):
-        grid.update_log_odds(
-            **arrays, l_occ=jnp.array(0.8), l_free=jnp.array(-0.4), spec=spec, min_range=0.1, max_range=3.0
-        )
+        grid.update_log_odds(**arrays, spec=spec, min_range=0.1, max_range=3.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), {"pose": (3,), "cov": (3, 3), "reach": (), "angle": (), "R": (2, 2)}.items()
+)
+def test_an_end_covariance_of_a_batch_is_refused_by_name(name, shape):
+    arrays = {"pose": (3,), "cov": (3, 3), "reach": (), "angle": (), "R": (2, 2)}
+    for wrong in ((5, *shape), (1,)):
+        with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got {re.escape(str(wrong))}$"):
+            grid.endpoint_covariance(**{key: jnp.ones(s) for key, s in (arrays | {name: wrong}).items()})
+
+
+def test_scores_of_many_maps_are_refused_by_name():
+    """Their sum would pass for the score of one."""
+    one, many = jnp.zeros((4, 4)), jnp.zeros((5, 4, 4))
+    with pytest.raises(ValueError, match=r"^log_odds: expected shape \(any, any\), got \(5, 4, 4\)$"):
+        grid.entropy_bits(many)
+    for score in (grid.brier, grid.calibration):
+        with pytest.raises(ValueError, match=r"^log_odds: expected shape \(any, any\), got \(5, 4, 4\)$"):
+            score(many, many > 0, many > 0)
+        with pytest.raises(ValueError, match=r"^occupied: expected shape \(4, 4\), got \(5, 4, 4\)$"):
+            score(one, many > 0, one > 0)
+        with pytest.raises(ValueError, match=r"^where: expected shape \(4, 4\), got \(4,\)$"):
+            score(one, one > 0, one[0] > 0)
+
+
+@pytest.mark.parametrize("origin", [(388_096.0, 0.0), (0.0, -3_948_996.0), (16_380.0, 0.0)])
+def test_a_grid_too_far_out_for_the_pose_s_precision_is_refused(origin):
+    """The last one ends 4 m beyond where float32 counts in millimetres; float64 holds them all."""
+    spec, scan = GridSpec(origin=origin, resolution=2.0, shape=(4, 4)), jnp.ones(2, jnp.float32)
+    maps = functools.partial(
+        grid.update_log_odds, jnp.zeros((4, 4), jnp.float32), spec=spec, min_range=0.1, max_range=3.0
+    )
+    with pytest.raises(ValueError, match=r"^grid: expected coordinates that float32 holds to 0\.001 m, got \d"):
+        jax.eval_shape(lambda pose: maps(pose, scan, scan, 0.8, -0.4), jnp.zeros(3, jnp.float32))
+    if jnp.result_type(float) == jnp.float64:
+        double = scan.astype(float)
+        jax.eval_shape(lambda pose: maps(pose, double, double, 0.8, -0.4), jnp.zeros(3))

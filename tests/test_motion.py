@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -50,17 +51,17 @@ def test_transition_and_jacobians_are_the_reference(name, tolerance):
     atol = tolerance(2e-9 if name == "capstone" else 1e-14, 1e-5)
     error = got - np.array([e[0] for e in expected])
     error[:, 2] = reference.wrap(error[:, 2])
-    np.testing.assert_allclose(error, 0, atol=atol)
-    np.testing.assert_allclose(F, [e[1] for e in expected], atol=atol)
-    np.testing.assert_allclose(G, [e[2] for e in expected], atol=atol)
+    np.testing.assert_allclose(error, 0, rtol=0, atol=atol)
+    np.testing.assert_allclose(F, [e[1] for e in expected], rtol=0, atol=atol)
+    np.testing.assert_allclose(G, [e[2] for e in expected], rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("name", ["euler", "arc"])
 def test_jacobians_are_the_derivatives_of_the_transition(name, tolerance):
     _, (F, G), (F_jax, G_jax) = library(name)
     atol = tolerance(1e-14, 2e-6)  # a few roundings of entries of order 1
-    np.testing.assert_allclose(F, F_jax, atol=atol)
-    np.testing.assert_allclose(G, G_jax, atol=atol)
+    np.testing.assert_allclose(F, F_jax, rtol=0, atol=atol)
+    np.testing.assert_allclose(G, G_jax, rtol=0, atol=atol)
 
 
 def test_from_transition_predicts_as_the_analytic_model(tolerance):
@@ -70,14 +71,36 @@ def test_from_transition_predicts_as_the_analytic_model(tolerance):
     own = motion.from_transition(motion.ARC.transition)
     one, other = (ekf.predict(pose, cov, control, dt, Q, motion=m, nominal_dt=0.1) for m in (own, motion.ARC))
     for got, expected in zip(one, other, strict=True):
-        np.testing.assert_allclose(got, expected, atol=tolerance(1e-15, 1e-7))
+        np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance(1e-15, 1e-7))
+
+
+SHAPES = {"pose": (3,), "control": (2,), "dt": ()}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("model", [*motion.MODELS.values(), motion.from_transition(motion.ARC.transition)])
+def test_a_batch_is_refused_by_name(model, name):
+    """Five poses side by side would be taken for one, of which only the first three count."""
+    arrays = {key: jnp.ones(shape) for key, shape in SHAPES.items()}
+    for wrong in ((5, *SHAPES[name]), (*SHAPES[name], 1), (1,)):
+        for function in model:
+            with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got {re.escape(str(wrong))}"):
+                function(*(arrays | {name: jnp.ones(wrong)}).values())
+
+
+@pytest.mark.parametrize("result", [(2,), (4,), (3, 3)])
+def test_a_transition_that_returns_no_pose_is_refused(result):
+    own = motion.from_transition(lambda pose, control, dt: jnp.full(result, pose[0]))
+    for function in own:
+        with pytest.raises(ValueError, match=r"^transition\(pose, control, dt\): expected shape \(3\), got"):
+            function(jnp.zeros(3), jnp.zeros(2), 0.1)
 
 
 @pytest.mark.parametrize("omega", OMEGAS)
 def test_two_half_arcs_are_the_whole_arc(omega, tolerance):
     pose, control = jnp.array([1.0, 2.0, -0.5]), jnp.array([0.8, omega])
     half = motion.ARC.transition(motion.ARC.transition(pose, control, 0.05), control, 0.05)
-    np.testing.assert_allclose(half, motion.ARC.transition(pose, control, 0.1), atol=tolerance(1e-15 * 8, 1e-6))
+    np.testing.assert_allclose(half, motion.ARC.transition(pose, control, 0.1), rtol=0, atol=tolerance(1e-15 * 8, 1e-6))
 
 
 def test_first_order_model_tends_to_the_arc(tolerance):
@@ -140,7 +163,9 @@ def test_a_robot_that_turns_round_and_round_keeps_its_heading_inside(name, toler
     _, headings = jax.lax.scan(turn, jnp.zeros(3), length=300)
     assert np.all(np.abs(headings) <= EDGE + ulps(1))
     error = reference.wrap(np.asarray(headings) - 0.4 * np.arange(1, 301))
-    np.testing.assert_allclose(error, 0, atol=tolerance(1e-12, 3e-4))  # 300 roundings of pi, at most 3 ulps a step
+    np.testing.assert_allclose(
+        error, 0, rtol=0, atol=tolerance(1e-12, 3e-4)
+    )  # 300 roundings of pi, at most 3 ulps a step
 
 
 # --- models by name, wheels
@@ -158,7 +183,7 @@ def test_a_model_passes_through():
 def test_wheels_and_control_are_inverse(tolerance):
     control = jnp.array(np.random.default_rng(0).normal(size=(4, 5, 2)))
     back = motion.from_wheels(*motion.to_wheels(control, 0.4), 0.4)
-    np.testing.assert_allclose(back, control, atol=tolerance(1e-14, 2e-6))
+    np.testing.assert_allclose(back, control, rtol=0, atol=tolerance(1e-14, 2e-6))
 
 
 def test_a_faster_right_wheel_turns_left():
@@ -176,6 +201,12 @@ def test_a_wheel_base_that_is_no_distance_is_refused(base):
         motion.from_wheels(jnp.array(1.0), jnp.array(1.0), base)
     with pytest.raises(ValueError, match="wheel_base: expected metres > 0"):
         motion.to_wheels(jnp.array([1.0, 0.0]), base)
+
+
+@pytest.mark.parametrize("wrong", [(3,), (2, 1), ()])
+def test_a_control_that_is_none_has_no_wheel_speeds(wrong):
+    with pytest.raises(ValueError, match=rf"^control: expected shape \(\.\.\., 2\), got {re.escape(str(wrong))}$"):
+        motion.to_wheels(jnp.ones(wrong), 0.4)
 
 
 def test_jacobians_keep_structure_so_that_products_with_it_vanish():

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 
 import chex
 import jax
@@ -25,6 +26,7 @@ from jaxlocmap import (
     map_scans,
     motion,
     run,
+    stages,
     step,
 )
 
@@ -112,7 +114,7 @@ def test_the_course_run_is_the_reference_to_every_field_and_cell(model, course, 
 def test_the_reference_is_the_courses_program():
     """Its own conventions give the numbers of the course's text."""
     course = reference.course_run()
-    np.testing.assert_allclose(course["mean"][-1], [6.46387367, 5.58104105, 0.32367098], atol=5e-9)
+    np.testing.assert_allclose(course["mean"][-1], [6.46387367, 5.58104105, 0.32367098], rtol=0, atol=5e-9)
     assert course["rmse_position"] == pytest.approx(0.0293, abs=5e-5)
     assert course["rmse_yaw"] == pytest.approx(0.0136, abs=5e-5)
     occupancy = [course[f"occupancy_{name}"] for name in ("min", "max", "mean")]
@@ -139,6 +141,7 @@ def random_drive(seed, offset=(0.0, 0.0, 0.0)):
             seen = landmark[k, m] if landmark[k, m] >= 0 else rng.integers(4)
             z[k, m] = reference.expected_observation(pose, reference.COURSE_LANDMARKS[seen], offset)[0]
     z += rng.normal(size=z.shape) * np.where(rng.random((STEPS, SLOTS, 1)) < 0.3, 3.0, 0.05)
+    z[..., 0] = np.abs(z[..., 0])
     return dt, control, landmark, z, valid
 
 
@@ -174,8 +177,8 @@ def test_without_observations_the_run_is_predict_alone(short, config, tolerance)
     predict = jax.jit(functools.partial(ekf.predict, motion=motion.ARC, nominal_dt=config.dt))
     for k in range(STEPS):
         mean, cov = predict(mean, cov, short.inputs.control[k], short.inputs.dt[k], short.params.Q)
-        np.testing.assert_allclose(info.belief.mean[k], mean, atol=tolerance(1e-15, 1e-6))
-        np.testing.assert_allclose(info.belief.cov[k], cov, atol=tolerance(1e-15, 1e-7))
+        np.testing.assert_allclose(info.belief.mean[k], mean, rtol=0, atol=tolerance(1e-15, 1e-6))
+        np.testing.assert_allclose(info.belief.cov[k], cov, rtol=0, atol=tolerance(1e-15, 1e-7))
     for field in (info.innovation, info.S, info.nis, info.log_likelihood, info.accepted):
         assert not jnp.any(field)
 
@@ -187,7 +190,7 @@ def test_data_without_noise_leaves_no_error(short, config, tolerance):
         truth.append(pose)
         z[k] = [reference.expected_observation(pose, mark)[0] for mark in reference.COURSE_LANDMARKS[-SLOTS:]]
     _, info = localise(edit(short, z=jnp.array(z), valid=jnp.ones((STEPS, SLOTS), bool)), config)
-    np.testing.assert_allclose(info.belief.mean, truth, atol=tolerance(1e-14, 1e-5))
+    np.testing.assert_allclose(info.belief.mean, truth, rtol=0, atol=tolerance(1e-14, 1e-5))
     assert np.all(info.accepted)
 
 
@@ -400,6 +403,24 @@ def test_a_landmark_on_the_sensor_is_flagged_and_not_used(short, config):
     assert info.row[0].tolist() == [-1, 1, *[-1] * (SLOTS - 2)]
 
 
+def test_a_landmark_within_an_arms_length_is_used(short, config):
+    """5 cm away it has a bearing, though a poor one."""
+    prior = Gaussian(jnp.array([1.0, 2.0, 0.0]), jnp.eye(3) * 1e-4)
+    inputs = short.inputs._replace(
+        control=jnp.zeros((STEPS, 2)),
+        landmark=jnp.zeros((STEPS, SLOTS), jnp.int32),
+        valid=jnp.zeros((STEPS, SLOTS), bool).at[0, 0].set(True),
+        z=jnp.broadcast_to(jnp.array([0.06, 0.02]), (STEPS, SLOTS, 2)),
+    )
+    marks = short.landmarks.at[0].set(jnp.array([1.05, 2.0]))
+    _, info = compiled(short.params, init(prior, config=config), inputs, landmarks=marks, config=config)
+    assert bool(jnp.all(info.ok))
+    assert info.row[0].tolist() == [0, *[-1] * (SLOTS - 1)]
+    assert bool(info.accepted[0, 0])
+    np.testing.assert_allclose(info.innovation[0, 0], [0.01, 0.02], rtol=0, atol=1e-6)
+    assert float(info.belief.cov[0, 1, 1]) < 1e-5  # it lies ahead: 0.03 rad of bearing are 1.5 mm across
+
+
 def test_info_says_which_landmark_an_anonymous_observation_was_taken_for(short, config):
     valid = np.asarray(short.inputs.valid)
     anonymous = edit(short, landmark=jnp.full_like(short.inputs.landmark, -1))
@@ -489,6 +510,57 @@ def test_the_priors_dtype_wins_over_that_of_everything_else(course, single):
     assert {x.dtype for x in jax.tree.leaves(state)} == {jnp.dtype(jnp.float64)}
 
 
+# --- precision
+
+UTM = np.array([388_096.0, 3_948_996.0, 0.3])
+
+
+def test_a_prior_that_becomes_float32_must_fit_into_it():
+    """As where x64 is off, whatever the prior came in; and a covariance may come in any."""
+    prior = Gaussian(UTM, np.eye(3) * 0.01)
+    with jax.enable_x64(False):
+        with pytest.raises(ValueError, match=r"^prior\.mean: expected .* float32 .* got 3\.949e\+06 m, .* subtract"):
+            init(prior, config=Config())
+        init(prior._replace(mean=np.array([16_000.0, -16_000.0, 0.0])), config=Config())
+    init(Gaussian(UTM.astype(np.float32) * 0, prior.cov), config=Config())
+
+
+def test_landmarks_poses_and_grids_must_fit_into_the_dtype_of_the_state(single):
+    far = Config(grid=GridSpec(origin=(UTM[0], 0.0), resolution=0.5, shape=(8, 8)))
+    with pytest.raises(ValueError, match=r"^config\.grid: expected coordinates that float32 holds"):
+        init(single.prior, config=far)
+    state = init(single.prior, config=single.config())
+    for marks in (np.tile(UTM[:2], (4, 1)), single.landmarks.at[2, 0].set(-16_384.0)):
+        with pytest.raises(ValueError, match=r"^landmarks: expected coordinates that float32 holds"):
+            run(single.params, state, single.inputs, landmarks=marks, config=single.config())
+    poses = jnp.zeros((STEPS, 3), jnp.float32).at[3, 1].set(2e4)
+    with pytest.raises(ValueError, match=r"^poses: expected coordinates that float32 holds"):
+        map_scans(
+            single.params,
+            jnp.zeros(single.grid.shape, jnp.float32),
+            poses,
+            single.inputs.ranges,
+            beam_angles=single.beam_angles,
+            config=single.config(mapping=True),
+        )
+
+
+@pytest.mark.parametrize(("x", "y", "fine"), [(16_000.0, 1.0, True), (16_390.0, 1.0, False), (1.0, -4e6, False)])
+def test_a_pose_that_the_dtype_cannot_hold_is_flagged_where_it_cannot_be_refused(x, y, fine, single):
+    config = single.config(mapping=True)
+    state = init(single.prior, config=config)
+    mean = jnp.array([x, y, 0.0], jnp.float32)
+    _, info = compiled(
+        single.params,
+        state._replace(belief=Gaussian(mean, state.belief.cov)),
+        single.inputs,
+        landmarks=single.landmarks,
+        beam_angles=single.beam_angles,
+        config=config,
+    )
+    assert info.ok.tolist() == [fine] * STEPS
+
+
 # --- unknown landmarks
 
 
@@ -534,6 +606,10 @@ def test_a_step_length_that_is_none_is_flagged(bad, short, config):
     _, info = localise(edit(short, dt=short.inputs.dt.at[4].set(bad)), config)
     np.testing.assert_array_equal(info.ok, np.arange(STEPS) != 4)
     assert np.all(np.isfinite(info.belief.cov))
+    # What it takes instead is a nominal step at rest, of which the belief grows.
+    rest = edit(short, dt=short.inputs.dt.at[4].set(config.dt), control=short.inputs.control.at[4].set(0.0))
+    chex.assert_trees_all_equal(info.belief, localise(rest, config)[1].belief)
+    assert float(info.belief.cov[4, 2, 2]) > float(info.belief.cov[3, 2, 2])
 
 
 def test_a_step_of_no_length_changes_nothing(short, config):
@@ -542,9 +618,12 @@ def test_a_step_of_no_length_changes_nothing(short, config):
     chex.assert_trees_all_equal(lane(info.belief, 4), lane(info.belief, 3))
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-@pytest.mark.parametrize("place", [0, 1])
-def test_an_observation_that_is_no_number_is_flagged_and_not_used(bad, place, short, config):
+@pytest.mark.parametrize(
+    ("bad", "place"),
+    [(math.nan, 0), (math.inf, 0), (-math.inf, 0), (math.nan, 1), (math.inf, 1), (0.0, 0), (-1e-3, 0), (-5.0, 0)],
+)
+def test_an_observation_that_is_no_measurement_is_flagged_and_not_used(bad, place, short, config):
+    """No number, or a range that is not above zero."""
     slot = int(np.flatnonzero(short.inputs.valid[5])[0])
     broken = edit(short, z=short.inputs.z.at[5, slot, place].set(bad))
     without = edit(short, valid=short.inputs.valid.at[5, slot].set(False))
@@ -802,6 +881,45 @@ def test_a_prior_that_cannot_be_is_refused(field, value, error, message, course)
 def test_a_prior_without_uncertainty_is_fine(course):
     state = init(course.prior._replace(cov=jnp.zeros((3, 3))), config=Config())
     assert state.log_odds is None
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("state.belief.mean", lambda s: s._replace(belief=s.belief._replace(mean=jnp.zeros((5, 3))))),
+        ("state.belief.cov", lambda s: s._replace(belief=s.belief._replace(cov=jnp.zeros((5, 3, 3))))),
+        ("state.log_likelihood", lambda s: s._replace(log_likelihood=jnp.zeros(5))),
+    ],
+)
+def test_a_state_of_many_runs_is_refused(name, change, course):
+    state = change(init(course.prior, config=Config()))
+    now = lane(course.inputs, 0)
+    with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got \(5"):
+        step(course.params, state, now, landmarks=course.landmarks, config=Config())
+
+
+@pytest.mark.parametrize("name", ["control", "dt", "z", "landmark", "row", "usable", "mean", "cov"])
+def test_what_a_step_is_made_of_refuses_a_batch_by_name(name, course):
+    shapes = {"control": (2,), "dt": (), "z": (2,), "landmark": (2,), "row": (), "usable": (), "mean": (3,)}
+    shapes["cov"] = (3, 3)
+    parts = (
+        lambda of: stages.predict(course.params, of("mean", "cov"), of("control"), of("dt"), config=Config()),
+        lambda of: stages.correct(
+            course.params, of("mean", "cov"), of("z"), of("landmark"), of("row"), of("usable") > 0, config=Config()
+        ),
+        lambda of: stages.sound(of("mean", "cov")),
+    )
+    uses = ({"control", "dt", "mean", "cov"}, {"z", "landmark", "row", "usable", "mean", "cov"}, {"mean", "cov"})
+    for wrong in ((5, *shapes[name]), (1,)):
+
+        def of(*names, wrong=wrong):
+            arrays = [jnp.ones(wrong if key == name else shapes[key]) for key in names]
+            return Gaussian(*arrays) if len(arrays) == 2 else arrays[0]
+
+        for part, used in zip(parts, uses, strict=True):
+            if name in used:
+                with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got {re.escape(str(wrong))}$"):
+                    part(of)
 
 
 @pytest.mark.parametrize(

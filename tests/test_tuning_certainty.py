@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from drives import ONLY_POSES, OWN, drives
 
 from jaxlocmap import tuning
@@ -49,22 +50,69 @@ def test_a_scale_that_is_left_open_is_named():
     hessian = np.eye(4) - np.outer(together, together)
     influence = np.random.default_rng(0).normal(size=(9, 4)) * 0.1
     open_scale = _judge(tuning.NOISE, np.ones(4), np.zeros(4), hessian, influence, np.eye(4))
-    assert open_scale.words == ("v, w, range, bearing can change together: the loss stays the same",)
+    assert open_scale.words[:1] == ("v, w, range, bearing can change together: the loss stays the same",)
     assert np.isinf(open_scale.standard_error).all()
+    np.testing.assert_array_equal(open_scale.interval_95, [[0, np.inf]] * 4)
 
 
 def test_vague_and_tied_parameters_are_named():
     influence = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     still, names = np.zeros(2), ("v", "w")
     vague = _judge(names, np.ones(2), still, np.diag([1.0, 100.0]), influence, np.eye(2))
-    assert vague.words == ("v: known to no more than a factor of 5.1 (one standard error)",)  # exp(sqrt(2 * 4 / 3))
+    few = "4 sequences are few: standard errors are known to some 41 %, and come out too small"  # 1 / sqrt(2 * 3)
+    assert vague.words == ("v: known to no more than a factor of 5.1 (one standard error)", few)  # exp(sqrt(2 * 4 / 3))
     moving = _judge(names, np.ones(2), np.array([0.0, 50.0]), np.diag([100.0, 100.0]), influence, np.eye(2))
-    assert moving.words == ("w: not yet at its minimum, some 31 standard errors away",)  # 0.5 / (sqrt(8 / 3) / 100)
+    assert moving.words == ("w: not yet at its minimum, some 31 standard errors away", few)  # 0.5 / (sqrt(8 / 3) / 100)
     saddle = _judge(names, np.ones(2), still, np.diag([100.0, -50.0]), influence, np.eye(2))
-    assert saddle.words == ("w: no minimum, the loss falls further along here",)
+    assert saddle.words == ("w: no minimum, the loss falls further along here", few)
     assert np.isinf(saddle.standard_error[1])
-    tied = _judge(names, np.ones(2), still, 1e3 * np.array([[1.0, 0.97], [0.97, 1.0]]), influence, np.eye(2))
-    assert tied.words[0].startswith("w and v: known in combination")
+
+
+@pytest.mark.parametrize(("correlation", "said"), [(0.94, False), (0.96, True), (-0.94, False), (-0.96, True)])
+def test_tied_parameters_are_named_from_a_correlation_of_095(correlation, said):
+    """Errors that are those of the influence: with H = 1 their covariance is its own."""
+    root = np.linalg.cholesky(np.array([[1.0, correlation], [correlation, 1.0]]))
+    white = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]] * 5) * 0.01
+    found = _judge(("v", "w"), np.ones(2), np.zeros(2), np.eye(2), white @ root.T, np.eye(2))
+    assert found.correlation[0, 1] == pytest.approx(correlation, abs=1e-12)
+    assert found.words == (
+        (f"w and v: known in combination, hardly apart (correlation {correlation:+.3f})",) if said else ()
+    )
+
+
+@pytest.mark.parametrize(("share", "flat"), [(0.5e-4, True), (2e-4, False)])
+def test_a_curvature_below_one_ten_thousandth_is_none(share, flat):
+    influence = np.random.default_rng(0).normal(size=(30, 2)) * 1e-6
+    found = _judge(("v", "w"), np.ones(2), np.zeros(2), np.diag([1.0, share]), influence, np.eye(2))
+    assert np.isinf(found.standard_error).tolist() == [False, flat]
+    assert ("w: the loss does not depend on it here" in found.words) == flat
+
+
+@pytest.mark.parametrize("n", [2, 8, 30])
+def test_errors_and_intervals_are_those_written_out(n):
+    """In units of the parameters, with Student's t, along the logarithm of what has one."""
+    rng = np.random.default_rng(n)
+    names = ("v", "v_w", "l_free")
+    estimate, scale = np.array([0.02, -0.4, -0.7]), np.array([[0.02, 0.001, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, -0.7]])
+    root = rng.normal(size=(3, 3))
+    hessian, influence = root @ root.T + np.eye(3), rng.normal(size=(n, 3)) * 0.05
+    found = _judge(names, estimate, np.zeros(3), hessian, influence, scale)
+    cov = np.zeros((3, 3))
+    for g in influence:
+        moved = scale @ np.linalg.solve(hessian, g)
+        cov += np.outer(moved, moved) * n / (n - 1)
+    error = np.sqrt(np.diag(cov))
+    np.testing.assert_allclose(found.standard_error, error, rtol=1e-10)
+    np.testing.assert_allclose(found.correlation, cov / np.outer(error, error), rtol=0, atol=1e-10)
+    reach = scipy.stats.t.ppf(0.975, n - 1) * error
+    times = np.exp(reach / np.abs(estimate))
+    expected = [
+        (0.02 / times[0], 0.02 * times[0]),
+        (max(-0.4 - reach[1], -1), min(-0.4 + reach[1], 1)),
+        (-0.7 * times[2], -0.7 / times[2]),
+    ]
+    np.testing.assert_allclose(found.interval_95, expected, rtol=1e-9)
+    assert any("sequences are few" in words for words in found.words) == (n < 20)
 
 
 def test_one_sequence_has_nothing_to_compare_with():
@@ -74,3 +122,5 @@ def test_one_sequence_has_nothing_to_compare_with():
         tuning.certainty(objective, OWN, one, NAMES)
     with pytest.raises(ValueError, match="tuned: expected some of"):
         tuning.certainty(objective, OWN, drives(), ())
+    with pytest.raises(ValueError, match="two equations"):
+        tuning.certainty(tuning.Objective(ONLY_POSES, (("nis", 1.0),)), OWN, drives(), tuning.NOISE)

@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 import scipy.optimize
-from drives import ONLY_POSES, OWN, SHORT, drives
+from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives
 from jax.flatten_util import ravel_pytree
 
 from jaxlocmap import simulate, tuning
@@ -98,6 +98,28 @@ def test_scipy_takes_the_same_gradient(x64):
 def test_no_epochs_and_no_steps_are_refused(name):
     with pytest.raises(ValueError, match=f"{name}: expected at least 1, got 0"):
         tuning.fit(OBJECTIVE, START, drives(scans=False), **{name: 0})
+
+
+@pytest.mark.parametrize("losses", [("nees",), ("nis",), ("nees", "nis"), ("nees", "map")])
+def test_two_equations_do_not_tell_three_parameters(losses):
+    objective = tuning.Objective(CONFIG, tuple((name, 1.0) for name in losses))
+    named = "`, `".join(name for name in losses if name != "map")
+    with pytest.raises(ValueError, match=rf"^tuned: the loss `{named}` compares .* two equations.* got v, w, range$"):
+        tuning.fit(objective, START, drives(), tuned=("v", "w", "range", "l_occ"))
+    objective.check_tuned(("v", "range", "l_occ", "l_free"))
+
+
+@pytest.mark.parametrize("losses", [("nees", "pose"), ("nis", "innovation"), ("nees", "nis", "state"), ("map",)])
+def test_beside_another_loss_they_may(losses):
+    tuning.Objective(CONFIG, tuple((name, 1.0) for name in losses)).check_tuned(tuning.NAMES)
+
+
+def test_a_batch_that_the_dtype_cannot_hold_is_refused():
+    batch = drives(scans=False)
+    far = batch._replace(landmarks=np.asarray(batch.landmarks, np.float32) + np.float32(388_096))
+    far = far._replace(prior=jax.tree.map(lambda x: x.astype(jnp.float32), far.prior))
+    with pytest.raises(ValueError, match=r"^batch\.landmarks: expected coordinates that float32 holds"):
+        tuning.fit(OBJECTIVE, START, far)
 
 
 def test_a_start_beyond_the_limits_is_refused():

@@ -32,6 +32,19 @@ def test_no_coordinates_are_invalid(values):
     assert all(abs(float(r)) <= 0.996 for r in correlations)
 
 
+@pytest.mark.parametrize("name", Params._fields)
+def test_a_batch_of_parameters_is_refused_by_name(name):
+    many = TILTED._replace(**{name: jnp.stack([getattr(TILTED, name)] * 5)})
+    for function in (unconstrain, natural):
+        with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got \(5"):
+            function(many)
+
+
+def test_a_batch_of_coordinates_is_refused_by_name():
+    with pytest.raises(ValueError, match=r"^range: expected shape \(\), got \(5,\)$"):
+        constrain(unconstrain(TILTED) | {"range": jnp.zeros(5)})
+
+
 def test_people_call_them_by_these_names(tolerance):
     got = natural(TILTED)
     assert tuple(got) == NAMES == tuple(UNITS)

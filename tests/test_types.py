@@ -236,3 +236,36 @@ def test_settings_given_as_lists_can_be_hashed():
 def test_params_made_of_lists_are_refused_by_name():
     with pytest.raises(TypeError, match="Q: expected an array, got list"):
         Params([[1.0, 0.0], [0.0, 1.0]], jnp.eye(2), jnp.array(1.0), jnp.array(-1.0)).check()
+
+
+# --- precision
+
+
+@pytest.mark.parametrize("kind", [jnp.float32, jnp.float64, jnp.float16])
+def test_the_farthest_coordinate_is_where_numbers_begin_to_lie_a_millimetre_apart(kind):
+    far = checks.farthest(kind)
+    assert np.spacing(np.nextafter(kind(far), kind(0))) <= 1e-3 < np.spacing(kind(far))
+
+
+@pytest.mark.parametrize("value", [16_384.0, -388_096.0, [[0.0, 3.0], [2.0, 3_948_996.0]]])
+def test_a_coordinate_that_a_type_cannot_hold_is_refused_with_what_to_do(value):
+    with pytest.raises(
+        ValueError, match=r"^here: expected .* float32 .* lie .* apart: subtract an origin, or use float64"
+    ):
+        checks.resolved("here", value, jnp.float32)
+    checks.resolved("here", value, jnp.float64)
+
+
+def test_the_spacing_is_said():
+    with pytest.raises(ValueError, match=r"got 388097 m, where its numbers lie 0\.031 m apart"):
+        checks.resolved("here", np.array([1.0, -388_097.0]), np.float32)
+    assert float(np.spacing(np.float32(388_097))) == 0.03125
+
+
+@pytest.mark.parametrize("value", [0.0, 16_383.9, [], [math.nan, math.inf, 1.0]])
+def test_what_a_type_can_hold_passes_and_what_is_no_number_is_no_matter_of_precision(value):
+    checks.resolved("here", np.array(value), jnp.float32)
+
+
+def test_what_is_traced_is_not_looked_at():
+    jax.eval_shape(lambda x: checks.resolved("here", x, jnp.float32), jnp.array(1e6))

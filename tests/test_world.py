@@ -1,6 +1,7 @@
 """Walls seen by a laser, against the reference, NumPy and rooms worked by hand, and the map they ought to give."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +78,31 @@ def test_a_beam_along_a_wall_and_a_world_without_walls_hit_nothing():
 
 
 # --- The true map ---
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("pose", (5, 3)),
+        ("pose", (2,)),
+        ("beam_angles", (5, 4)),
+        ("beam_angles", ()),
+        ("segments", (5, 8, 2, 2)),
+        ("segments", (2, 2)),
+        ("segments", (8, 2, 3)),
+        ("max_range", (4,)),
+    ],
+)
+def test_a_batch_is_refused_by_name(name, wrong):
+    arrays = {"pose": (3,), "beam_angles": (4,), "segments": (8, 2, 2), "max_range": ()} | {name: wrong}
+    with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got {re.escape(str(wrong))}$"):
+        world.ray_cast(**{key: jnp.ones(shape) for key, shape in arrays.items()})
+
+
+@pytest.mark.parametrize("wrong", [(5, 8, 2, 2), (2, 2), (8, 2, 3)])
+def test_walls_of_many_worlds_have_no_map(wrong):
+    with pytest.raises(ValueError, match=rf"^world\.segments: expected shape .*, got {re.escape(str(wrong))}$"):
+        world.occupancy(World(jnp.ones(wrong), jnp.zeros((0, 2))), GridSpec((0.0, 0.0), 1.0, (4, 5)))
 
 
 def drawn(cells):

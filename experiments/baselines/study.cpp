@@ -462,9 +462,10 @@ struct Robot {
         if (measured.looks)
             for (int j = 0; j < kLandmarks; ++j) {
                 const float dx = world.landmark[j].x - x, dy = world.landmark[j].y - y;
-                const float range = std::sqrt(dx * dx + dy * dy) + kRangeNoise * normal();
+                const float distance = std::sqrt(dx * dx + dy * dy);
+                const float range = distance + kRangeNoise * normal();
                 const float bearing = wrap(std::atan2(dy, dx) - theta + kBearingNoise * normal());
-                measured.sighting[j] = {range, bearing, range < kSightRange};
+                measured.sighting[j] = {range, bearing, distance < kSightRange};
             }
         if (!scans) return;
         ray_cast(world, x, y, theta, measured.range);

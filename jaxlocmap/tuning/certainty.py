@@ -7,16 +7,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.tuning.losses import Objective
-from jaxlocmap.tuning.parameters import check_names, constrain, natural, unconstrain
+from jaxlocmap.tuning.parameters import CORRELATIONS, constrain, natural, unconstrain
 from jaxlocmap.types import Params
 
 _VAGUE = 1.0  # a standard error of a coordinate above this is said in words
 _TIED = 0.95  # a correlation above this: only a combination is known
-_FLAT = 1e-6  # of the largest curvature: none
+_FLAT = 1e-4  # of the largest curvature: none
 _PART = 0.1  # of a direction's unit length: a parameter that has a part in it
+_FEW = 20  # sequences: from fewer, standard errors come out too small
 
 
 class Certainty(NamedTuple):
@@ -25,6 +27,7 @@ class Certainty(NamedTuple):
     names: tuple[str, ...]
     estimate: np.ndarray  # (P,) in the units of `parameters.UNITS`
     standard_error: np.ndarray  # (P,) the same units; infinite where the data does not tell
+    interval_95: np.ndarray  # (P, 2) from and to, the same units
     correlation: np.ndarray  # (P, P) of the estimates' errors
     hessian: np.ndarray  # (P, P) of the objective by the coordinates
     words: tuple[str, ...]  # what the data cannot tell
@@ -41,19 +44,23 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
     correlated in time make the windows longer than the correlation. The blocks of one map are not independent: each
     finds the map that those before it have made. The Hessian leaves out the kinks at the bounds of a map's log-odds.
 
+    An interval reaches as many standard errors as Student's t with N - 1 degrees says; along the logarithm, so that no
+    deviation comes out negative, but for correlations, which it keeps within ±1. From fewer than 20 sequences standard
+    errors tend to be too small all the same, and the words say so.
+
     Args:
         params: where the objective is at its minimum; where it is not, the words say so. batch: of at least two
             sequences, what it was tuned on. tuned: which of `parameters.NAMES`.
 
     Raises:
-        ValueError: fewer than two sequences, or nothing to tune.
+        ValueError: fewer than two sequences, nothing to tune, or more than the losses tell (`Objective.check_tuned`).
 
     Source: Efron 1982, section 6; White 1982; Giordano et al. 2019.
     """
     n = len(batch.counted)
     if n < 2:
         raise ValueError(f"batch: expected at least two sequences to compare, got {n}; cut long ones into windows")
-    check_names(tuned)
+    objective.check_tuned(tuned)
     whole = unconstrain(params)
     theta = jnp.stack([whole[name] for name in tuned]).astype(jnp.asarray(batch.prior.mean).dtype)
 
@@ -130,7 +137,24 @@ def _judge(
         for j in range(i)
         if abs(correlation[i, j]) > _TIED and not (lost[i] or lost[j])
     ]
-    return Certainty(names, estimate, np.where(lost, np.inf, error), correlation, hessian, tuple(words))
+    if n < _FEW:
+        vague = 100 / np.sqrt(2 * (n - 1))
+        words.append(f"{n} sequences are few: standard errors are known to some {vague:.0f} %, and come out too small")
+    error = np.where(lost, np.inf, error)
+    return Certainty(names, estimate, error, _interval(names, estimate, error, n), correlation, hessian, tuple(words))
+
+
+def _interval(names: tuple[str, ...], estimate: np.ndarray, error: np.ndarray, n: int) -> np.ndarray:
+    """What holds the value in 95 of 100 tunings, (P, 2), from n sequences."""
+    reach = scipy.special.stdtrit(n - 1, 0.975) * error
+    ends = []
+    for name, value, far in zip(names, estimate, reach, strict=True):
+        if name in CORRELATIONS:
+            ends.append((max(value - far, -1.0), min(value + far, 1.0)))
+        else:
+            factor = np.exp(far / abs(value))
+            ends.append(sorted((value / factor, value * factor)))
+    return np.array(ends)
 
 
 def _tied(names: tuple[str, ...], axis: np.ndarray) -> str:

@@ -37,7 +37,7 @@ def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[
     Raises:
         ValueError, TypeError: as `pipeline.run`; fields of the batch that do not fit.
     """
-    check_shapes(batch)
+    check_batch(batch)
     config = dataclasses.replace(config, grid=None)
     dtype = jnp.asarray(batch.prior.mean).dtype
     params, landmarks, truth = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, batch.landmarks, batch.truth))
@@ -64,11 +64,12 @@ def beliefs(params: Params, batch: Batch, *, config: Config) -> Gaussian:
     return filtered(params, batch, config=config, collect=lambda info, _: info.belief)
 
 
-def check_shapes(batch: Batch) -> None:
+def check_batch(batch: Batch) -> None:
     """Raise if the fields of a batch do not fit.
 
     Raises:
-        ValueError: a wrong shape. TypeError: a field that is no array.
+        ValueError: a wrong shape, or a pose or landmark, when it can be looked at, so far out that the dtype of the
+            prior cannot hold it to a millimetre. TypeError: a field that is no array.
     """
     checks.shape("batch.counted", batch.counted, (None, None))
     n, steps = np.shape(batch.counted)
@@ -78,3 +79,7 @@ def check_shapes(batch: Batch) -> None:
     for name, shape in (("truth", (n, steps, 3)), ("known", (n, steps)), ("poses", (n, steps, 3))):
         if getattr(batch, name) is not None:
             checks.shape(f"batch.{name}", getattr(batch, name), shape)
+    places = {"prior.mean": batch.prior.mean, "truth": batch.truth, "poses": batch.poses, "landmarks": batch.landmarks}
+    for name, value in places.items():
+        if value is not None:
+            checks.resolved(f"batch.{name}", value[..., :2], jnp.result_type(batch.prior.mean))

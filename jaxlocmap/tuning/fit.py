@@ -16,7 +16,7 @@ import optax
 from jaxlocmap.tuning.batch import Batch, pick
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.losses import Objective
-from jaxlocmap.tuning.parameters import NOISE, Coordinates, check_names, constrain, natural, unconstrain
+from jaxlocmap.tuning.parameters import NOISE, Coordinates, constrain, natural, unconstrain
 from jaxlocmap.types import Params
 
 
@@ -57,9 +57,10 @@ def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str
         tuned = constrain(unconstrain(params) | unravel(found.x))
 
     Raises:
-        ValueError: nothing to tune, a name that is none of `NAMES`, or parameters beyond the limits of `constrain`.
+        ValueError: nothing to tune, a name that is none of `NAMES`, more than the losses tell
+            (`Objective.check_tuned`), or parameters beyond the limits of `constrain`.
     """
-    check_names(tuned)
+    objective.check_tuned(tuned)
     params.check()
     inside = natural(constrain(unconstrain(params)))
     for name, value in natural(params).items():
@@ -111,8 +112,9 @@ def fit(
         `Fit`. A step whose loss or gradient is not finite is skipped and counted in its trace.
 
     Raises:
-        ValueError: nothing to tune or nothing to tune on, a start that cannot be judged (`Objective.check`), a
-            minibatch without a key or larger than the batch, no epochs or steps.
+        ValueError: nothing to tune or nothing to tune on, more than the losses tell (`Objective.check_tuned`), a start
+            that cannot be judged (`Objective.check`), a minibatch without a key or larger than the batch, no epochs or
+            steps.
     """
     runs = len(batch.counted)
     for name, number in (("epochs", epochs), ("steps", steps), ("patience", patience)):

@@ -24,12 +24,14 @@ from jaxlocmap import consistency
 from jaxlocmap.foresight import Foresight, foresee
 from jaxlocmap.linalg import Matrix, ldl
 from jaxlocmap.tuning.batch import Batch
-from jaxlocmap.tuning.filtering import Judged, check_shapes, filtered
+from jaxlocmap.tuning.filtering import Judged, check_batch, filtered
 from jaxlocmap.tuning.forward import forward
+from jaxlocmap.tuning.parameters import SENSOR_MODEL, check_names
 from jaxlocmap.types import Config, Info, Params
 
 OUTLIER_SHARE = 0.01  # of observations, what `innovation` allows for
 LEVER = 1.0  # m: a heading error of 1 rad counts in `state` as a position error of this
+_TWO_EQUATIONS = ("nees", "nis")  # which compare a mean and a spread
 _FAR = 1e-4  # share of good values beyond which `nees` and `nis` count distances by their logarithm
 
 
@@ -97,6 +99,8 @@ def nees(params: Params, batch: Batch, *, config: Config) -> jax.Array:
     m and s are mean and standard deviation of sqrt(NEES) over steps with truth, and m_chi, s_chi those of χ with 3
     degrees. A filter that is too modest half of the time and too sure the other half has the right mean and the wrong
     spread. Beyond the 0.9999 quantile distances grow with their logarithm, so that a lost run does not decide.
+
+    Two equations tell two parameters at most; with more there are filters without number that meet them.
 
     Args, returns: as in `innovation`, dimensionless, of a batch with truth. Source: Gelbrich 1990 (it is a lower bound
     of the squared Wasserstein distance, met if both distributions have one shape).
@@ -235,6 +239,25 @@ class Objective:
         total, terms = self.value(jax.tree.map(jnp.sum, _tallied(self, params, batch)[0]))
         return float(total), {name: float(term) for name, term in terms.items()}
 
+    def check_tuned(self, tuned: tuple[str, ...]) -> None:
+        """Raise if so many parameters cannot be told apart by these losses.
+
+        `nees` and `nis` compare a mean and a spread with those of χ. Two equations carry two parameters of Q and R; the
+        loss is zero along whole surfaces of three or more.
+
+        Raises:
+            ValueError: nothing to tune, a name that is none of `NAMES`, or more than two of Q and R for these alone.
+        """
+        check_names(tuned)
+        noise = [name for name in tuned if name not in SENSOR_MODEL]
+        of_filter = [name for name in self.names if name != "map"]
+        if len(noise) > 2 and of_filter and set(of_filter) <= set(_TWO_EQUATIONS):
+            raise ValueError(
+                f"tuned: the loss `{'`, `'.join(of_filter)}` compares a mean and a spread, two equations, which tell "
+                f"no more than two parameters: expected one or two of Q and R, or `pose`, `innovation` or `state` "
+                f"beside it, got {', '.join(noise)}"
+            )
+
     def check(self, params: Params, batch: Batch) -> None:
         """Raise if there is nothing to tune on, or if the start cannot be judged.
 
@@ -242,7 +265,7 @@ class Objective:
             ValueError: a loss whose observations, truth or scans are not there; a filter that refuses everything at
                 `params`; a loss that is not finite there, with the number of sequences at fault.
         """
-        check_shapes(batch)
+        check_batch(batch)
         observed = np.asarray(batch.inputs.valid) & np.asarray(batch.counted)[..., None]
         for name in self.names:
             needs = LOSSES[name].needs

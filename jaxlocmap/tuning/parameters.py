@@ -7,6 +7,7 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxlocmap import checks
 from jaxlocmap.types import Params
 
 Coordinates = dict[str, jax.Array]
@@ -15,6 +16,7 @@ Coordinates = dict[str, jax.Array]
 NAMES = ("v", "w", "v_w", "range", "bearing", "range_bearing", "l_occ", "l_free")
 NOISE = ("v", "w", "range", "bearing")  # with Q and R diagonal
 FULL_NOISE = ("v", "w", "v_w", "range", "bearing", "range_bearing")
+CORRELATIONS = ("v_w", "range_bearing")
 SENSOR_MODEL = ("l_occ", "l_free")
 UNITS: dict[str, str] = dict(zip(NAMES, ("m/s", "rad/s", "–", "m", "rad", "–", "nats", "nats"), strict=True))
 
@@ -39,7 +41,11 @@ def unconstrain(params: Params) -> Coordinates:
 
     Source: Pinheiro & Bates 1996, the log-Cholesky parametrisation; the entry off the diagonal is in units of its
     row's diagonal.
+
+    Raises:
+        ValueError: a wrong shape; a batch of parameters is a `vmap`.
     """
+    _check_shapes(params)
     return {
         **_log_cholesky(params.Q, "v", "w"),
         **_log_cholesky(params.R, "range", "bearing"),
@@ -59,7 +65,11 @@ def constrain(coordinates: Coordinates) -> Params:
 
     Returns:
         `Params` that `Params.check` accepts.
+
+    Raises:
+        ValueError: a wrong shape; a batch of coordinates is a `vmap`.
     """
+    checks.shapes(**{name: (value, ()) for name, value in coordinates.items()})
     return Params(
         Q=_covariance(coordinates, "v", "w"),
         R=_covariance(coordinates, "range", "bearing"),
@@ -69,13 +79,22 @@ def constrain(coordinates: Coordinates) -> Params:
 
 
 def natural(params: Params) -> dict[str, jax.Array]:
-    """What people call the parameters, by the same names: standard deviations, correlations, log-odds."""
+    """What people call the parameters, by the same names: standard deviations, correlations, log-odds.
+
+    Raises:
+        ValueError: a wrong shape; a batch of parameters is a `vmap`.
+    """
+    _check_shapes(params)
     return {
         **_deviations(params.Q, "v", "w"),
         **_deviations(params.R, "range", "bearing"),
         "l_occ": params.l_occ,
         "l_free": params.l_free,
     }
+
+
+def _check_shapes(params: Params) -> None:
+    checks.shapes(Q=(params.Q, (2, 2)), R=(params.R, (2, 2)), l_occ=(params.l_occ, ()), l_free=(params.l_free, ()))
 
 
 def _log_cholesky(cov: jax.Array, first: str, second: str) -> Coordinates:
