@@ -19,6 +19,8 @@ from jaxlocmap.types import GridSpec
 
 # Beams of up to so many cells, on maps of up to so many, float32 places exactly; others take integer divisions.
 _EXACT_SPAN, _EXACT_MAP = 1024, 1 << 24
+_LONGEST_SPAN = 1 << 20  # cells: up to here those divisions do not overflow
+_FAR = 2.0**29  # cells: a point beyond is as far outside as any, and a difference of two such fits an int32
 
 
 class Beams(NamedTuple):
@@ -57,7 +59,7 @@ def cell_of(point: jax.Array, spec: GridSpec) -> jax.Array:
 def _cell_along(coordinate: jax.Array, axis: int, spec: GridSpec) -> jax.Array:
     # Far and non-finite points go to a cell just as far outside, instead of wherever an integer wraps to.
     cell = jnp.floor((coordinate - spec.origin[axis]) / spec.resolution)
-    return jnp.clip(jnp.nan_to_num(cell, nan=-1e6), -1e6, 1e6).astype(jnp.int32)
+    return jnp.clip(jnp.nan_to_num(cell, nan=-_FAR), -_FAR, _FAR).astype(jnp.int32)
 
 
 def on_map(pose: jax.Array, spec: GridSpec) -> jax.Array:
@@ -90,7 +92,7 @@ def beam_cells(
         `Beams`; nothing is free or hit for a robot outside the map, nor beyond the edge.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: a wrong shape, or a `max_range` of more than about a million cells.
     """
     lines = trace(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
     j = jnp.arange(longest(spec, max_range), dtype=jnp.int32)[None]
@@ -111,6 +113,12 @@ def trace(
     checks.shape("pose", pose, (3,))
     checks.shape("beam_angles", beam_angles, (None,))
     checks.shape("ranges", ranges, np.shape(beam_angles))
+    limit = _span_limit(spec, max_range)
+    if limit > _LONGEST_SPAN:
+        raise ValueError(
+            f"max_range: expected beams of up to {_LONGEST_SPAN:,} cells, got {max_range} m, {limit:,} cells of "
+            f"{spec.resolution} m"
+        )
     measured = jnp.isfinite(ranges) & (ranges > min_range) & on_map(pose, spec)
     reach = jnp.where(measured, jnp.minimum(ranges, max_range), 0.0)
     # Rotating a table of beam directions costs two products a beam; a cosine a beam costs far more.
@@ -120,8 +128,9 @@ def trace(
 
     start = cell_of(pose[:2], spec)
     spans = tuple(_cell_along(end, axis, spec) - start[axis] for axis, end in enumerate(ends))
-    n = jnp.maximum(jnp.abs(spans[0]), jnp.abs(spans[1]))
-    exact = _span_limit(spec, max_range) <= _EXACT_SPAN and math.prod(spec.shape) <= _EXACT_MAP
+    # In float32, which is exact here: XLA gets the larger of integers' magnitudes wrong on NVIDIA's devices.
+    n = jnp.maximum(*(jnp.abs(m.astype(jnp.float32)) for m in spans)).astype(jnp.int32)
+    exact = limit <= _EXACT_SPAN and math.prod(spec.shape) <= _EXACT_MAP
     # A straight line that has left the map does not come back: its cells on the map are its first.
     sides = zip(spans, start, spec.shape[::-1], strict=True)
     inside = jnp.minimum(*(_cells_inside(m, n, first, cells, exact) for m, first, cells in sides))
@@ -148,12 +157,25 @@ def _cells_inside(m: jax.Array, n: jax.Array, start: jax.Array, cells: int, exac
     """How many cells of a beam come before the first outside the map along one axis; more than n where none does."""
     # Outside is d cells away, which ceil(j m / n - 1/2) reaches at the first j above n (2 d - 1) / (2 m).
     d = jnp.minimum(jnp.where(m > 0, cells - start, start + 1), n + 1)
-    above, below = n * (2 * d - 1), jnp.maximum(2 * jnp.abs(m), 1)
+    above, below = 2 * d - 1, jnp.where(m == 0, 1, 2 * jnp.abs(m))
     if exact:  # half up, the quotient is further from every integer than any way to divide in float32 is off by
-        whole = jnp.floor((above.astype(jnp.float32) + 0.5) / below.astype(jnp.float32)).astype(jnp.int32)
+        whole = jnp.floor(((n * above).astype(jnp.float32) + 0.5) / below.astype(jnp.float32)).astype(jnp.int32)
     else:
-        whole = above // below
+        whole = jnp.where(above < below, _times_over(n, above, below)[0], n)
     return jnp.where(m == 0, n, whole) + 1
+
+
+def _times_over(a: jax.Array, b: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Quotient and remainder of a b divided by c, whole numbers, int32.
+
+    For 0 <= a <= 2^20, 0 <= b <= c and 0 < c <= 2^21, where a b does not fit: a is taken as 1024 times one number plus
+    another.
+    """
+    a, b, c = (x.astype(jnp.uint32) for x in (a, b, c))
+    high, low = a >> 10, a & 1023
+    whole, rest = jnp.divmod(b << 10, c)
+    more, rest = jnp.divmod(high * rest + low * b, c)
+    return (high * whole + more).astype(jnp.int32), rest.astype(jnp.int32)
 
 
 def cells_at(lines: Lines, j: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -182,7 +204,8 @@ def _along(lines: Lines, axis: int, j: jax.Array) -> jax.Array:
     if jnp.issubdtype(slope.dtype, jnp.floating):
         return jnp.floor(j.astype(slope.dtype) * slope + lines.offset[axis, :, None])
     n = lines.offset[0, :, None]
-    return jnp.sign(slope) * ((2 * j * jnp.abs(slope) + n - 1) // (2 * n))
+    whole, rest = _times_over(j, jnp.abs(slope), n)
+    return jnp.sign(slope) * (whole + (2 * rest > n).astype(jnp.int32))
 
 
 def longest(spec: GridSpec, max_range: float) -> int:

@@ -117,7 +117,7 @@ def test_float32_counts_the_cells_inside_as_integers_do(n):
     m, start = jnp.arange(-n, n + 1, dtype=jnp.int32)[None], jnp.arange(n + 2, dtype=jnp.int32)[:, None]
     inside = jax.jit(lambda exact: beams._cells_inside(m, jnp.int32(n), start, n + 2, exact), static_argnums=0)
     fast, slow = inside(True), inside(False)
-    np.testing.assert_array_equal(fast, slow)
+    np.testing.assert_array_equal(np.minimum(fast, n + 1), slow)
     # Cell j is the first outside where it is, and j - 1 is not.
     first = np.asarray(slow, np.int64)
     away = np.where(m > 0, n + 2 - start, start + 1)
@@ -139,6 +139,51 @@ def test_a_beam_far_longer_than_the_map_is_bresenhams_as_far_as_the_map_goes():
     np.testing.assert_array_equal(found.free, expected < side)
     np.testing.assert_array_equal(found.row, expected)
     assert not np.any(found.hit)
+
+
+def test_products_that_do_not_fit_are_divided_as_pythons_integers_are():
+    rng = np.random.default_rng(3)
+    a, c = rng.integers(0, 2**20, 3000, endpoint=True), rng.integers(1, 2**21, 3000, endpoint=True)
+    b = rng.integers(0, c, endpoint=True)
+    edges = [(2**20, 2**21, 2**21), (2**20 - 1, 2**21 - 1, 2**21), (2**20, 2**20, 2**20), (0, 0, 1), (1023, 1, 1)]
+    a, b, c = (np.append(x, y) for x, y in zip((a, b, c), zip(*edges, strict=True), strict=True))
+    got = jax.jit(beams._times_over)(*(jnp.asarray(x, jnp.int32) for x in (a, b, c)))
+    np.testing.assert_array_equal(got, np.divmod(a * b, c))  # in 64 bits
+
+
+@functools.partial(jax.jit, static_argnames=("spec", "max_range"))
+def some_cells(pose, ranges, angles, j, *, spec, max_range):
+    lines = beams.trace(pose, ranges, angles, spec=spec, min_range=0.0, max_range=max_range)
+    return lines.free, lines.last, beams.cells_at(lines, j)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("n", [9_000, 32_767, 32_768, 46_341, 1_000_003, 2**20 - 50])
+def test_a_very_long_beam_is_bresenhams(n):
+    """To every cell of the last column and beyond the map's sides, against integers of 64 bits."""
+    rows, start = 4_001, (1, 1_000)
+    up = np.array([0, 1, -1, 7, -1000, 1499, -1499, 2997, 3000, -3001, 9_000, -9_000])
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=(rows, n + 2))
+    pose = jnp.array([*((np.array(start) + 0.5) * 0.5), 0.0])
+    ranges, angles = jnp.array(np.hypot(n, up) * 0.5), jnp.array(np.arctan2(up, n))
+    j = np.array([0, 1, n // 3, n // 2, n - 1, n])
+    free, last, (column, row) = some_cells(
+        pose, ranges, angles, jnp.asarray(j[None], jnp.int32), spec=spec, max_range=0.5 * (2**20 - 1)
+    )
+    away = np.sign(up)[:, None] * ((2 * j * abs(up)[:, None] + n - 1) // (2 * n))
+    np.testing.assert_array_equal(column, np.broadcast_to(start[0] + j, away.shape))
+    np.testing.assert_array_equal(row, start[1] + away)
+    every = start[1] + np.sign(up)[:, None] * ((2 * np.arange(n + 1) * abs(up)[:, None] + n - 1) // (2 * n))
+    on_map = (every >= 0) & (every < rows)
+    first_outside = np.where(on_map.all(1), n + 1, np.argmin(on_map, axis=1))
+    np.testing.assert_array_equal(free, np.minimum(first_outside, n))
+    np.testing.assert_array_equal(last, np.where(first_outside > n, n, -1))
+
+
+def test_beams_of_more_cells_than_can_be_counted_are_refused():
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.05, shape=(10, 10))
+    with pytest.raises(ValueError, match=r"^max_range: expected beams of up to 1,048,576 cells, got 60000\.0 m"):
+        beams.trace(jnp.zeros(3), jnp.ones(2), jnp.zeros(2), spec=spec, min_range=0.0, max_range=6e4)
 
 
 @pytest.mark.usefixtures("x64")
@@ -167,11 +212,20 @@ def test_cell_of_a_point_is_a_floor_and_may_lie_outside():
     np.testing.assert_array_equal(beams.cell_of(points, SPEC), [[0, 0], [-1, -1], [23, 15], [24, 16]])
 
 
-@pytest.mark.parametrize("far", [1e7, 1e20, np.inf, np.nan])
+@pytest.mark.usefixtures("x64")
+def test_a_point_millions_of_cells_away_is_in_its_own():
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.1, shape=(2, 5_000_000))
+    point = jnp.array([[123_456.78, 0.05], [-400_000.01, 3e6]])
+    np.testing.assert_array_equal(beams.cell_of(point, spec), [[1_234_567, 0], [-4_000_001, 30_000_000]])
+    assert beams.on_map(jnp.array([499_999.95, 0.05, 0.0]), spec)
+    assert not beams.on_map(jnp.array([500_000.05, 0.05, 0.0]), spec)
+
+
+@pytest.mark.parametrize("far", [1e9, 1e20, np.inf, np.nan])
 def test_a_point_beyond_all_integers_is_far_outside(far):
     below, above = np.asarray(beams.cell_of(jnp.array([[-far, -far], [far, far]]), SPEC))
-    assert np.all(below <= -1_000_000)
-    assert np.all(abs(above) >= 1_000_000)
+    assert np.all(below <= -(2**29))
+    assert np.all(abs(above) >= 2**29)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
-"""Chunks chosen from shapes, against bytes counted by hand; a chunk that memory does not hold."""
+"""Chunks chosen from what a run carries and what its program holds; a chunk that memory does not hold."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -7,126 +8,137 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import batching, chunks
+from jaxlocmap import chunks, simulate
 from jaxlocmap.monte_carlo import monte_carlo
+from jaxlocmap.parts import Parts
+from jaxlocmap.study import Study
 
 KEY = jax.random.key(0)
+DEVICES = tuple(jax.local_devices()[:1])
 
 
-def vector(*shape):
-    return jnp.ones(shape, jnp.float32)
+@dataclasses.dataclass(frozen=True)
+class Silent:
+    """A run that carries so many float32 through a loop."""
+
+    size: int
+
+    def __call__(self, key):
+        start = jnp.full(self.size, jax.random.uniform(key, (), jnp.float32))
+        return jax.lax.fori_loop(0, 9, lambda _, c: jnp.sin(c) + c[0], start)
 
 
-def need(function, *args):
-    return chunks.run_bytes(jax.make_jaxpr(function)(*args))
+class Telling(Silent):
+    """One that says so."""
+
+    def carried(self, key):
+        del key
+        return jnp.zeros(self.size, jnp.float32)
 
 
-# --- Bytes of a run ---
+def run_of(function, *args):
+    return chunks.OneRun.of(function, False, KEY, jax.tree.map(jnp.asarray, args))
 
 
-def looping(x):
-    """Carries 100 floats, makes 3,000 in its body, stacks 20 times 7."""
-
-    def body(carry, _):
-        wide = carry[:, None] * vector(1, 30)
-        return carry + wide.sum(1), carry[:7]
-
-    return jax.lax.scan(body, x, length=20)
+# --- What a run says it carries ---
 
 
-def test_a_loop_needs_its_carry_and_the_largest_value_of_its_body():
-    # Outside it: the last carry and what was stacked.
-    assert need(looping, vector(100)) == (4 * (100 + 3000), 4 * (100 + 20 * 7))
+@pytest.mark.parametrize("limits", [chunks.CPU, chunks.ACCELERATOR], ids=["cpu", "accelerator"])
+@pytest.mark.parametrize("size", [1, 100, 3000, 10**5, 10**9])
+def test_the_loop_of_a_chunk_works_inside_the_cache(size, limits):
+    """It reads one carry and writes another."""
+    fit = chunks.foreseen(run_of(Telling(size)), limits)
+    assert fit <= limits.most
+    assert fit == limits.most or 8 * size * fit <= limits.working < 8 * size * (fit + 1)
 
 
-def test_the_same_is_seen_through_calls_and_branches():
-    alone = need(looping, vector(100))
-    assert need(jax.jit(looping), vector(100)) == alone
-    branched = need(lambda x: jax.lax.cond(x.sum() > 0, lambda: looping(x)[0], lambda: x), vector(100))
-    assert branched.working == alone.working
-    assert alone.resident <= branched.resident <= alone.resident + 4 * 100 + 16  # and the branch's result
+@pytest.mark.parametrize("limits", [chunks.CPU, chunks.ACCELERATOR], ids=["cpu", "accelerator"])
+def test_a_run_that_says_nothing_or_carries_nothing_gets_the_largest_chunk(limits):
+    assert chunks.foreseen(run_of(Silent(10**9)), limits) == limits.most
+    assert chunks.foreseen(run_of(Telling(0)), limits) == limits.most
 
 
-def test_a_loop_in_a_loop_adds_its_need_to_the_outer_carry():
-    def outer(x, y):
-        return jax.lax.scan(lambda carry, _: (carry + looping(x)[0].sum(), None), y, length=3)
-
-    assert need(outer, vector(100), vector(10)).working == 4 * (10 + 100 + 3000)
-
-
-def test_a_while_loop_counts_all_it_carries():
-    def until(x):
-        return jax.lax.while_loop(lambda c: c[1] < 5, lambda c: (c[0] * 2, c[1] + 1), (x, jnp.int32(0)))
-
-    assert need(until, vector(50)).working == 4 * (50 + 1 + 50)
-
-
-def test_without_a_loop_the_largest_value_counts_and_what_is_dead_does_not():
-    def straight(x):
-        a = x * 2  # 1,000 floats, alive until b is made
-        b = a + 1
-        return b.sum() * 3
-
-    assert need(straight, vector(1000)) == (4000, 8000)
-
-
-def test_what_is_summed_over_the_runs_counts_for_no_run():
-    def add_up(x, counted):
-        def body(carry, _):
-            return 2 * carry, (batching.sum_over_runs(carry, counted), carry[:7])
-
-        return jax.lax.scan(body, x, length=20)
-
-    jaxpr = jax.make_jaxpr(add_up, axis_env=[(batching.RUNS, 1)])(vector(100), True)
-    assert chunks.run_bytes(jaxpr).resident == 4 * (100 + 20 * 7)
+@pytest.mark.parametrize("mapping", [False, True])
+def test_a_study_says_what_its_map_takes(mapping):
+    scenario = simulate.CAPSTONE
+    config = scenario.config(grid=mapping)
+    prior = jax.tree.map(lambda x: x.astype(jnp.float32), scenario.prior())
+    run = run_of(Study(scenario, config), simulate.course_params(), simulate.room(), simulate.Noise(), prior)
+    # Mean and covariance, the log-likelihood, and the map: written once and read once.
+    size = 4 * (3 + 9 + 1 + (np.prod(config.grid.shape) if mapping else 0))
+    for limits in (chunks.CPU, chunks.ACCELERATOR):
+        assert chunks.foreseen(run, limits) == min(limits.working // (2 * size), limits.most)
 
 
 # --- The choice ---
 
 
-def chosen(function, *args, runs=10**9, devices=1, platform="cpu"):
-    return chunks.from_shapes(jax.make_jaxpr(function)(*args), runs, devices, platform)
-
-
-@pytest.mark.parametrize("size", [1, 100, 3000, 10**5, 10**7])
-def test_a_chunk_fills_the_cache_or_the_memory_and_neither_overflows(size):
-    def grid(x):
-        return jax.lax.fori_loop(0, 9, lambda _, c: c + 1, x)
-
-    chunk, each = chosen(grid, vector(size)), need(grid, vector(size))
-    assert chunk % 8 == 0
-    assert 8 <= chunk <= chunks.CPU.most
-    loads = (chunk + 8) * np.array(each) > (chunks.CPU.working, chunks.CPU.resident)
-    assert any(loads) or chunk == chunks.CPU.most
-    assert all(chunk * np.array(each) <= (chunks.CPU.working, chunks.CPU.resident)) or chunk == 8
-    assert chosen(grid, vector(size), platform="gpu") >= chunk
-
-
-def test_what_a_run_stacks_limits_the_chunk_too():
-    def stacking(x):
-        return jax.lax.scan(lambda c, _: (c + 1, c), x, length=10**5)
-
-    fit = chunks.CPU.resident // need(stacking, vector(1)).resident
-    assert chosen(stacking, vector(1)) == fit // 8 * 8 < chunks.CPU.most
-
-
-def test_a_run_without_any_array_gets_the_largest_chunk():
-    assert chosen(lambda: (), runs=10**9) == chunks.CPU.most
-
-
 def test_many_runs_are_cut_alike_for_any_number_of_devices_and_few_evenly():
-    def tiny(x):
-        return x + 1
-
     most = chunks.CPU.most
-    assert {chosen(tiny, vector(1), runs=1000 * most, devices=n) for n in (1, 2, 3, 64)} == {most}
+    assert {chunks.even(most, 1000 * most, devices) for devices in (1, 2, 3, 64)} == {most}
+    assert [chunks.even(fit, 10**9, 2) for fit in (1, 8, 9, 79, 80)] == [8, 8, 8, 72, 80]
     for runs, devices, expected in [(5, 2, 3), (most, 2, most // 2), (most + 2, 1, most // 2 + 1), (1, 8, 1)]:
-        assert chosen(tiny, vector(1), runs=runs, devices=devices) == expected
+        assert chunks.even(most, runs, devices) == expected
     for runs in (7 * most + 1, 8 * most, 8 * most + 1, 3 * most - 1):
-        chunk = chosen(tiny, vector(1), runs=runs, devices=2)
+        chunk = chunks.even(most, runs, 2)
         turns = -(-runs // (2 * chunk))
         assert turns == -(-runs // (2 * most))  # no more than with the whole chunk
         assert turns * 2 * chunk - runs < 2 * turns  # and the last one is as full as the others
+
+
+def choose(monkeypatch, need, runs=10**9, run=Silent(1)):
+    """The chunk for programs that `need` so many bytes for a chunk, and the chunks that were compiled."""
+    tried = []
+
+    def compile(run, chunk, devices):
+        tried.append(chunk)
+        return SimpleNamespace(need=need(chunk))
+
+    monkeypatch.setattr(chunks, "compile", compile)
+    monkeypatch.setattr(chunks, "limits_of", lambda device: chunks.Limits(8 * 2**20, 256 * 2**20, 3000))
+    return chunks.choose(run_of(run), runs, 1, DEVICES), tried
+
+
+def test_what_holds_little_enough_is_compiled_once(monkeypatch):
+    assert choose(monkeypatch, lambda chunk: 256 * 2**20) == (3000, [3000])
+    assert choose(monkeypatch, lambda chunk: 2**20, run=Telling(14_000)) == (72, [72])
+    assert choose(monkeypatch, lambda chunk: 10**20, runs=5) == (5, [5])  # no fewer than the lanes
+
+
+def test_what_holds_too_much_is_compiled_again_for_as_many_as_fit(monkeypatch):
+    assert choose(monkeypatch, lambda chunk: 2**20 * chunk) == (256, [3000, 256])
+    # A part that does not depend on the chunk makes the first step too small.
+    assert choose(monkeypatch, lambda chunk: 200 * 2**20 + 2**20 * chunk) == (56, [3000, 240, 120, 56])
+    assert choose(monkeypatch, lambda chunk: 10**20)[0] == 8
+
+
+def test_what_the_compiler_refuses_is_taken_smaller(monkeypatch):
+    def need(chunk):
+        if chunk > 200:
+            raise ValueError
+        return 1
+
+    assert choose(monkeypatch, need) == (184, [3000, 184])
+
+
+def test_a_run_with_a_large_carry_of_which_it_says_nothing_fits_anyway(monkeypatch):
+    """With the compiler's own numbers, instead of those above."""
+    monkeypatch.setattr(chunks, "CPU", chunks.CPU._replace(resident=2**20))
+    monkeypatch.setattr(chunks, "limits_of", lambda device: chunks.CPU)
+    chunk = chunks.choose(run_of(Silent(1000)), 10**6, 1, DEVICES)
+    need = chunks.compile(run_of(Silent(1000)), chunk, DEVICES).need
+    assert chunk % 8 == 0
+    assert 4 * 1000 * chunk <= need <= 2**20
+    assert chunk >= 2**20 // (8 * 4 * 1000)  # a few such arrays a run are all it needs
+
+
+def test_an_accelerator_may_hold_a_quarter_of_the_memory_it_says_it_has():
+    def device(stats):
+        return SimpleNamespace(platform="gpu", memory_stats=lambda: stats)
+
+    assert chunks.limits_of(device({"bytes_limit": 64 * 2**30})).resident == 16 * 2**30
+    assert chunks.limits_of(device(None)) == chunks.limits_of(device({})) == chunks.ACCELERATOR
+    assert chunks.limits_of(SimpleNamespace(platform="cpu")) == chunks.CPU
 
 
 # --- Memory ---
@@ -137,25 +149,81 @@ def hungry(key):
 
 
 def test_a_chunk_larger_than_memory_is_refused_before_it_starts():
-    with pytest.raises(ValueError, match=r"chunk: expected one that fits into the memory, got 1000000000 runs") as told:
+    with pytest.raises(ValueError, match=r"chunk: expected one that fits into the memory, got 1000000000 runs"):
         monte_carlo(hungry, KEY, 10**9, chunk=10**9)
+
+
+def test_a_program_says_what_it_holds():
     # Each run holds its 240 random numbers at least.
-    number = jnp.zeros(()).dtype.itemsize
-    assert float(str(told.value).split("about ")[1].split(" GB")[0].replace(",", "")) > 240 * number
+    need = chunks.compile(run_of(hungry), 1000, DEVICES).need
+    assert 1000 * 240 * jnp.zeros(()).dtype.itemsize < need < 1000 * 240 * 8 * 16
 
 
-def test_the_estimate_says_what_would_fit(monkeypatch):
+def program(need, platform, devices, run=lambda *_: []):
+    mesh = SimpleNamespace(size=devices, devices=np.array([SimpleNamespace(platform=platform)] * devices))
+    return chunks.Program(run, 100, mesh, need)
+
+
+def test_the_refusal_says_what_would_fit(monkeypatch):
     monkeypatch.setattr(chunks, "_available", lambda device: 10**9)
-    sizes = SimpleNamespace(temp_size_in_bytes=9 * 10**8, output_size_in_bytes=10**8, argument_size_in_bytes=0)
-    compiled, device = SimpleNamespace(memory_analysis=lambda: sizes), SimpleNamespace(platform="cpu")
-    chunks.check_memory(compiled, 100, [device])
+    program(10**9, "cpu", 1).check_memory()
     with pytest.raises(ValueError, match=r"100 runs on each of 2 devices, which need about 2\.0 GB of 1\.0 .* 50 fit$"):
-        chunks.check_memory(compiled, 100, [device, device])
-    accelerator = SimpleNamespace(platform="gpu")  # each has a memory of its own
-    chunks.check_memory(compiled, 100, [accelerator, accelerator])
-    sizes.temp_size_in_bytes += 1
+        program(10**9, "cpu", 2).check_memory()
+    program(10**9, "gpu", 2).check_memory()  # each has a memory of its own
     with pytest.raises(ValueError, match="chunk: expected one that fits"):
-        chunks.check_memory(compiled, 100, [accelerator, accelerator])
+        program(10**9 + 1, "gpu", 2).check_memory()
+    program(0, "gpu", 1).check_memory()
+    monkeypatch.setattr(chunks, "_available", lambda device: None)
+    program(10**20, "gpu", 1).check_memory()
+
+
+REFUSAL = r"^chunk: expected one that fits into the memory, got 100 runs on each of 2 devices: RESOURCE_EXHAUSTED: Out"
+
+
+def out_of_memory(*_):
+    raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory while trying to allocate 894 GiB.\n and more")
+
+
+def broken(*_):
+    raise jax.errors.JaxRuntimeError("INTERNAL: something else")
+
+
+def test_a_device_that_runs_out_of_memory_gives_the_same_kind_of_error():
+    with pytest.raises(ValueError, match=REFUSAL):
+        program(0, "gpu", 2, out_of_memory).compute(np.zeros(2, np.int32))
+    with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL: something else"):
+        program(0, "gpu", 2, broken).compute(np.zeros(2, np.int32))
+
+
+def test_a_compiler_that_runs_out_of_memory_does_too(monkeypatch):
+    lowered = SimpleNamespace(compile=out_of_memory)
+    monkeypatch.setattr(chunks.jax, "jit", lambda function: SimpleNamespace(lower=lambda *_: lowered))
+    with pytest.raises(ValueError, match=r"^chunk: .* got 99 runs on each of 1 devices: RESOURCE_EXHAUSTED"):
+        chunks.compile(run_of(Silent(2)), 99, DEVICES)
+
+
+def test_what_was_finished_when_memory_ran_out_stays(monkeypatch, tmp_path):
+    compile, turns = chunks.compile, []
+
+    def failing(*args):
+        program = compile(*args)
+
+        def run(*args):
+            turns.append(args)
+            return out_of_memory() if len(turns) == 30 else program.run(*args)
+
+        return program._replace(run=run)
+
+    failing.cache_info = compile.cache_info
+    parts = Parts(tmp_path / "parts")
+    monkeypatch.setattr(chunks, "compile", failing)
+    with pytest.raises(ValueError, match="chunk: expected one that fits"):
+        monte_carlo(Silent(3), KEY, 400, chunk=8, parts=parts, devices=DEVICES)
+    monkeypatch.undo()
+    assert 0 < parts.runs_kept <= 29 * 8
+    resumed = monte_carlo(Silent(3), KEY, 400, chunk=8, parts=Parts(tmp_path / "parts", resume=True), devices=DEVICES)
+    assert resumed.resumed_runs == parts.runs_kept
+    np.testing.assert_array_equal(resumed.value, monte_carlo(Silent(3), KEY, 400, chunk=8, devices=DEVICES).value)
 
 
 def test_the_memory_left_is_what_the_machine_and_its_control_groups_leave(monkeypatch):
