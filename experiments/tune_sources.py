@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from common import scenario_of
 from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of, prior_at
-from map_log import MapLogConfig, extent, first_scans
+from map_log import first_scans, ready, say_doubts
 
 from jaxlocmap import Config, Gaussian, Params, simulate, tuning
 from jaxlocmap.foresight import Foresight
@@ -154,11 +154,11 @@ def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) 
     log = read(path, "carmen")
     scans = min(len(log.scan), 60) if wanted.quick else len(log.scan)
     log = first_scans(log, scans)
-    spec = extent(log, MapLogConfig(log=path, format="carmen", resolution=resolution, max_range=max_range))
-    config = Config(grid=spec, min_range=0.05, max_range=max_range)
+    mapped, _, config = ready(log, resolution, max_range)
+    say_doubts(log, config.max_range)
     half = scans // 2
-    whole = _scans(log, scans)
-    first = _scans(log, half)
+    whole = _scans(mapped, scans)
+    first = _scans(mapped, half)
     number = np.arange(half) // max(half // 25, 1)
     train, validation = (
         first._replace(counted=(number % 5 != 4)[None]),

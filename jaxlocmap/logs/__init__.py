@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from jaxlocmap.logs.carmen import read_carmen
 from jaxlocmap.logs.mrclam import read_mrclam
@@ -32,17 +33,18 @@ __all__ = [
 FORMATS = ("woods", "mrclam", "carmen")
 
 
-def read(path: str | Path, format: str, robot: int | None = None) -> Log:
+def read(path: str | Path, format: str, robot: int | None = None, **scanner: Any) -> Log:
     """Read a log of a named format.
 
     Args:
         path: a file for `woods` and `carmen`, a folder for `mrclam`.
         format: one of `FORMATS`.
         robot: its number, for `mrclam` only.
+        scanner: keywords of `read_carmen`, for `carmen` only.
 
     Raises:
-        ValueError: an unknown format, `robot` missing for mrclam or given for another; and as the readers
-            raise.
+        ValueError: an unknown format, `robot` missing for mrclam or given for another, `scanner` for another
+            than carmen; and as the readers raise.
         FileNotFoundError: as the readers raise.
     """
     if format not in FORMATS:
@@ -50,6 +52,8 @@ def read(path: str | Path, format: str, robot: int | None = None) -> Log:
     if (robot is None) == (format == "mrclam"):
         wanted = "a robot's number" if format == "mrclam" else "None: only mrclam has several"
         raise ValueError(f"robot: expected {wanted} for format {format}, got {robot}")
+    if scanner and format != "carmen":
+        raise ValueError(f"{', '.join(scanner)}: expected nothing: format {format} has no laser scanner")
     if robot is not None:
         return read_mrclam(path, robot)
-    return read_woods(path) if format == "woods" else read_carmen(path)
+    return read_woods(path) if format == "woods" else read_carmen(path, **scanner)

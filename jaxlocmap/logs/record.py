@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from dataclasses import field
 
 import numpy as np
@@ -22,12 +23,14 @@ _ZERO = functools.partial(np.zeros, 3)
 class Log:
     """One robot's log, float64 NumPy, each stream in file order; length 0 where a stream is absent.
 
-    Bearings and beam angles are counter-clockwise from straight ahead; `sensor_offset` is where the landmark
-    sensor sits in the body frame.
+    Bearings and beam angles are counter-clockwise from straight ahead. `sensor_offset` is where the landmark
+    sensor sits in the body frame; it moves no laser: `scan` is seen from the poses in `truth`, which a reader of
+    laser logs gives for the scanner itself.
 
     Raises:
         ValueError: streams whose shapes do not belong together, a stamp or value that is not finite (`scan`
-            may hold NaN), or a sighting of a row that `landmarks` does not have.
+            may hold NaN and infinity), a sighting of a row that `landmarks` does not have, or a maximum range
+            that is not positive.
     """
 
     name: str
@@ -38,8 +41,11 @@ class Log:
     sighting_landmark: np.ndarray = field(default_factory=_INTS)  # (K,) int32: row of `landmarks`, -1 unknown
     sighting: np.ndarray = field(default_factory=_PAIRS)  # (K, 2) range m, bearing rad
     scan_time: np.ndarray = field(default_factory=_NUMBERS)  # (S,) s
-    scan: np.ndarray = field(default_factory=_SCANS)  # (S, B) m, NaN: no return
-    beam_angles: np.ndarray = field(default_factory=_NUMBERS)  # (B,) rad, body frame
+    scan: np.ndarray = field(default_factory=_SCANS)  # (S, B) m, inf: no return, NaN: no measurement
+    scan_line: np.ndarray = field(default_factory=_INTS)  # (S,) int32: line of the file; (0,) where there are none
+    beam_angles: np.ndarray = field(default_factory=_NUMBERS)  # (B,) rad, scanner's frame
+    beam_angles_from: str = ""  # "log", "user" or "assumed": who says them
+    scan_max_range: float = math.inf  # m, how far the scanner sees, where the log or the user says
     truth_time: np.ndarray = field(default_factory=_NUMBERS)  # (J,) s
     truth: np.ndarray = field(default_factory=_POSES)  # (J, 3) m, m, rad; tracked, or corrected by SLAM
     sensor_offset: np.ndarray = field(default_factory=_ZERO)  # (3,) m, m, rad in the body frame
@@ -58,6 +64,7 @@ class Log:
             ("sighting", (sightings, 2)),
             ("scan_time", (scans,)),
             ("scan", (scans, beams)),
+            ("scan_line", (scans if len(self.scan_line) else 0,)),
             ("beam_angles", (beams,)),
             ("truth_time", (poses,)),
             ("truth", (poses, 3)),
@@ -67,6 +74,8 @@ class Log:
             checks.shape(name, value, shape)
             if name != "scan" and not np.all(np.isfinite(value)):
                 raise ValueError(f"{name}: expected finite values, got {np.sum(~np.isfinite(value))} others")
+        if not self.scan_max_range > 0:
+            raise ValueError(f"scan_max_range: expected metres > 0, got {self.scan_max_range}")
         rows = self.sighting_landmark
         if sightings and not (rows.min() >= -1 and rows.max() < len(self.landmarks)):
             raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import gzip
 import math
 import zlib
@@ -37,16 +38,20 @@ def read_bytes(path: str | Path) -> bytes:
 def lines(path: str | Path) -> Iterator[tuple[int, str]]:
     """Yield (line number from 1, stripped line) for each line that is neither blank nor a `#` comment.
 
+    Byte-order marks are no part of a line; UTF-16 text with one is read like any other.
+
     Raises:
         FileNotFoundError, ValueError: as `read_bytes`; ValueError also for a file with zero bytes in it.
     """
     data = read_bytes(path)
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        data = data.decode("utf-16", errors="replace").encode()
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
         raise ValueError(f"{path}:{line}: expected text, got binary data")
     for number, raw in enumerate(data.splitlines(), 1):
         # Latin-1 takes any byte: old logs have comments in unknown encodings, and numbers are ASCII.
-        line = raw.decode("latin-1").strip()
+        line = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1").strip()
         if line and not line.startswith("#"):
             yield number, line
 
@@ -66,13 +71,25 @@ def numbers(fields: Sequence[str], names: Sequence[str], where: str, *, finite: 
 
 def _number(name: str, field: str, where: str, finite: bool) -> float:
     try:
-        value = float(field)
+        value = float(field) if field.isascii() and "_" not in field else None  # Python reads 2_5 as 25
     except ValueError:
         value = None
     if value is None or (finite and not math.isfinite(value)):
         kind = "a finite number" if finite else "a number"
         raise ValueError(f"{where}: {name}: expected {kind}, got {field[:40]!r}")
     return value
+
+
+def whole(name: str, field: str, where: str, *, least: int) -> int:
+    """Parse a whole number that is not negative, in ASCII digits.
+
+    Raises:
+        ValueError: something else, or one below `least`; the message starts with `where` and gives the name.
+    """
+    digits = field.isascii() and field.isdecimal() and len(field) < 10
+    if not digits or int(field) < least:
+        raise ValueError(f"{where}: {name}: expected a whole number >= {least}, got {field[:40]!r}")
+    return int(field)
 
 
 def table(path: str | Path, names: Sequence[str], *, integer: Collection[str] = ()) -> np.ndarray:
