@@ -162,10 +162,11 @@ def _cells(picture: np.ndarray, mode: str, negate: bool, high: float, low: float
     occupancy = shade / 255 if negate else (255 - shade) / 255
     between = np.full_like(shade, UNKNOWN)
     if mode == "scale":
-        opaque = np.all(picture[..., 3:] == 255, axis=-1)
         between = np.floor(99 * ((occupancy - low) / max(high - low, np.finfo(float).tiny)))
     cells = np.where(occupancy > high, OCCUPIED, np.where(occupancy < low, FREE, between))
-    return (cells if mode == "trinary" else np.where(opaque, cells, UNKNOWN)).astype(np.int8)
+    if mode == "scale":
+        cells[np.any(picture[..., 3:] < 255, axis=-1)] = UNKNOWN
+    return cells.astype(np.int8)
 
 
 def _read_picture(path: Path) -> np.ndarray:

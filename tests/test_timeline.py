@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from pathlib import Path
 
 import jax
@@ -125,11 +126,11 @@ def test_streams_that_touch_overlap():
 @pytest.fixture(scope="module")
 def localized(tmp_path_factory):
     """Runs the program on a case, in this process, and keeps its report."""
-    import localize
-
     root = os.environ.get("JAXLOCMAP_DATA")
     if not root:
         pytest.skip("JAXLOCMAP_DATA does not name a folder with the real logs")
+    sys.path.append(str(Path(__file__).parent.parent / "experiments"))
+    import localize
 
     def report(case, **settings):
         folder = Path(root).parent / "cases" / case
