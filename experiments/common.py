@@ -228,7 +228,7 @@ def show(title: str, rows: list[tuple[str, str, str]]) -> None:
     CONSOLE.print(table)
 
 
-def count_rows(counts: dict[str, int]) -> list[tuple[str, str, str]]:
+def count_rows(counts: Mapping[str, float]) -> list[tuple[str, str, str]]:
     """Rows of what a reader dropped or mended; those of nothing are left to the report."""
     return [
         (f"dropped or mended in the log: {name.replace('_', ' ')}", str(count), "")

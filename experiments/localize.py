@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from common import CONSOLE, command_line, count_rows, output_folder, params_or, 
 
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, consistency, init, plotting, run
 from jaxlocmap.hosts import merge_kernels
-from jaxlocmap.logs import Log, Timeline, read, to_timeline, write_tum
+from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline, write_tum
 
 _PIECE = 2000  # steps between two moves of the progress bar
 
@@ -45,6 +46,9 @@ class LocalizeConfig:
     """Probability with which a good observation passes the gate; None for no gate."""
     max_range: float | None = None
     """Sightings at or beyond are left out, m."""
+    max_gap: float = MAX_GAP
+    """The longest interval over which a command holds and truth is interpolated, s. In a longer gap of the odometry
+    the robot is taken to stand."""
     start: tuple[float, float, float] | None = None
     """Pose to start from, m, m, rad; by default the first true pose."""
     seed: int = 0
@@ -67,7 +71,7 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
     if config.start is not None and not np.all(np.isfinite(config.start)):
         raise ValueError(f"start: expected a finite pose X Y THETA, got {config.start}")
     begin = float(log.truth_time.min()) if config.start is None else None
-    timeline = to_timeline(log, max_range=config.max_range, start=begin)
+    timeline = to_timeline(log, max_range=config.max_range, start=begin, max_gap=config.max_gap)
     if config.quick:
         timeline = _first(timeline, _PIECE)
     with jax.enable_x64(True):
@@ -78,11 +82,38 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
         start = first_pose(log, timeline) if config.start is None else np.array(config.start)
         prior = prior_at(start)
         CONSOLE.print(f"{len(timeline.time)} steps of {log.name}; compiling takes some seconds")
+        for sentence in (said := time_sentences(log, timeline.counts, config.max_gap)):
+            CONSOLE.print(f"careful: {sentence}", highlight=False)
         info = filter_log(params, prior, timeline.inputs, log.landmarks, settings)
         report = judge(log, timeline, info, settings)
+    report["careful"] = said
     report["params"] = {name: np.asarray(value).tolist() for name, value in params._asdict().items()}
     _write(out, log, timeline, info, report)
     return report
+
+
+def time_sentences(log: Log, counts: Mapping[str, float], max_gap: float) -> list[str]:
+    """What a user should know of the log's time."""
+    sentences = []
+    if counts["odometry_gaps"]:
+        sentences.append(
+            f"the odometry pauses for more than {max_gap:g} s, {counts['odometry_gaps']} time(s): the robot is taken "
+            f"to stand there, {counts['odometry_gap_seconds']:g} s in all"
+        )
+    for what, stamps in (("truth", len(log.truth_time)), ("odometry", len(log.odometry_time))):
+        repeated = counts[f"duplicate_{what}"]
+        if repeated > stamps / 2:
+            sentences.append(
+                f"{repeated:,} of {stamps:,} stamps of the {what} repeat another, and the last of each counts: were "
+                f"they written with too few digits?"
+            )
+    seen = log.sighting_time
+    if len(seen) and not np.any((seen >= log.odometry_time.min()) & (seen <= log.odometry_time.max())):
+        sentences.append(
+            f"sightings from {seen.min():.3f} to {seen.max():.3f} s, none in the time of the odometry, "
+            f"{log.odometry_time.min():.3f} to {log.odometry_time.max():.3f} s: do their clocks differ?"
+        )
+    return sentences
 
 
 def prior_at(pose: np.ndarray) -> Gaussian:

@@ -31,7 +31,7 @@ def check_count(name: str, value: Any, least: int = 1, most: int | None = None) 
     """
     whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     if not whole or int(value) < least:
-        raise ValueError(f"{name}: expected at least {least}, a whole number, got {value}")
+        raise ValueError(f"{name}: expected at least {least}, a whole number, got {value!r}")
     if most is not None and int(value) > most:
         raise ValueError(f"{name}: expected at most {most}, got {value}")
 

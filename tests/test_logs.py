@@ -552,12 +552,12 @@ def test_start_stop_and_what_is_dropped():
         sightings=[(0.5, 1, 1, 0), (2, 1, 5, 0), (3, 1, 4.999, 0), (5, 1, 1, 0), (6, 1, 1, 0)],
         scans=[(0.0, [1.0]), (2.0, [2.0]), (3.0, [3.0])],
     )
-    full = logs.to_timeline(log, max_range=5)
+    full = logs.to_timeline(log, max_range=5, max_gap=3)
     np.testing.assert_array_equal(full.time, [1, 2, 3, 4, 5, 6])
     assert full.counts["before_odometry"] == 2
     assert full.counts["beyond_max_range"] == 1  # at the range counts as beyond
     assert full.inputs.valid.sum() == 3
-    part = logs.to_timeline(log, start=2.5, stop=5)
+    part = logs.to_timeline(log, start=2.5, stop=5, max_gap=3)
     np.testing.assert_array_equal(part.time, [3, 4, 5])
     np.testing.assert_array_equal(part.inputs.dt, [0, 1, 1])
     np.testing.assert_array_equal(part.inputs.control[:, 0], [0.1, 0.1, 0.4])
@@ -587,15 +587,16 @@ def test_truth_between_samples():
             (7.0, 1, 1, math.pi),
         ],
     )
-    timeline = logs.to_timeline(log)
+    timeline = logs.to_timeline(log)  # with a step in each gap of the odometry, at 2.35 and 5.25
     # Outside the truth and in its gaps nothing is known, on a sample it is, whatever lies beside it.
-    np.testing.assert_array_equal(timeline.truth_valid, [0, 1, 1, 1, 0, 1, 1, 0])
+    np.testing.assert_array_equal(timeline.truth_valid, [0, 1, 1, 1, 0, 0, 1, 0, 1, 0])
     np.testing.assert_array_equal(np.isnan(timeline.truth).all(axis=1), ~timeline.truth_valid)
     np.testing.assert_array_equal(timeline.truth[2, :2], [1, 2])
     # Half way from 3 to -3 the short way round is pi, written -pi.
     assert abs(timeline.truth[2, 2] + math.pi) < 1e-15 or abs(timeline.truth[2, 2] - math.pi) < 1e-15
-    np.testing.assert_allclose(timeline.truth[5, 2], 2 * math.pi - 4, rtol=1e-15)
-    assert timeline.truth[6, 2] == -math.pi
+    np.testing.assert_allclose(timeline.truth[6, 2], 2 * math.pi - 4, rtol=1e-15)
+    assert timeline.truth[8, 2] == -math.pi
+    assert timeline.counts["truth_gaps"] == 2
     known = timeline.truth[timeline.truth_valid, 2]
     assert np.all((known >= -math.pi) & (known < math.pi))
 
@@ -621,7 +622,7 @@ values = st.integers(1, 3).map(float)
 def test_timeline_keeps_everything_once(odometry, sightings, scan_stamps, max_range):
     """Against loops over the events; small whole numbers, so sums are exact and stamps often coincide."""
     log = log_of(odometry, sightings, [(t, [t]) for t in scan_stamps])
-    time, inputs, _, _, counts = logs.to_timeline(log, max_range=max_range)
+    time, inputs, _, _, counts = logs.to_timeline(log, max_range=max_range, max_gap=13)
     command = {t: (v, w) for t, v, w in odometry}  # the last at a stamp wins
     first = min(command)
     near = [s for s in dict.fromkeys(sightings) if max_range is None or s[2] < max_range]

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxlocmap import GridSpec
 from jaxlocmap.mapfile import FREE, OCCUPIED, UNKNOWN, load_map, save_map, trinary
@@ -93,6 +94,43 @@ def test_log_odds_of_another_shape_than_the_grid_are_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+NAMES = [
+    "a#b",
+    "a #b",
+    "a: b",
+    "- a",
+    "'quoted'",
+    'say "hi"',
+    "back\\slash",
+    "küche",
+    "🤖",
+    "! &a *b",
+    "{a}",
+    " ",
+    "a\nb",
+    "v1.2",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_any_name_of_a_file_comes_back(tmp_path, name):
+    cells = save_map(tmp_path, np.array([[-4.0, 0.0, 4.0]]), GridSpec((0.0, 0.0), 1.0, (1, 3)), name=name)
+    assert {path.name for path in tmp_path.iterdir()} == {f"{name}.pgm", f"{name}.yaml"}
+    np.testing.assert_array_equal(load_map(tmp_path / f"{name}.yaml").cells, cells)
+
+
+@pytest.mark.parametrize("name", ["floor/kitchen", "a/b: c/- d", "../beside"])
+def test_a_name_with_folders_is_taken_from_the_folder_on(tmp_path, name):
+    cells = save_map(tmp_path / "maps", np.array([[-4.0, 4.0]]), GridSpec((0.0, 0.0), 1.0, (1, 2)), name=name)
+    np.testing.assert_array_equal(load_map(tmp_path / "maps" / f"{name}.yaml").cells, cells)
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "/", "floor/.."])
+def test_a_name_that_is_none_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match="name: expected the name of a file without suffix"):
+        save_map(tmp_path, np.zeros((1, 1)), GridSpec((0.0, 0.0), 1.0, (1, 1)), name=name)
+
+
 # --- What others wrote ---
 
 
@@ -107,6 +145,77 @@ def test_a_negated_picture_has_light_walls(tmp_path):
     loaded = load_map(written(tmp_path, SHEET.replace("negate: 0", "negate: 1")))
     # 0/255 is free, 254/255 and 205/255 = 0.8 occupied, 100/255 = 0.39 unknown.
     np.testing.assert_array_equal(loaded.cells, [[UNKNOWN, OCCUPIED, OCCUPIED], [FREE, OCCUPIED, OCCUPIED]])
+
+
+def painted(folder, pixels, mode, sheet=SHEET, **options):
+    """A PNG of the pixels, read by the sheet with a mode, top row first."""
+    Image.fromarray(np.asarray(pixels, options.pop("dtype", np.uint8))).save(folder / "map.png", **options)
+    (folder / "map.yaml").write_text(sheet.replace("map.pgm", "map.png") + f"mode: {mode}\n")
+    return load_map(folder / "map.yaml").cells[::-1]
+
+
+# p = 0.196 + 0.454 r: at 205, 0.196078 (r = 0.0002); at 150, 0.411765 (0.4752); at 90, 0.647059 (0.9935).
+SCALED = [[254, 205, 150], [90, 89, 0]]
+
+
+def test_scale_grades_what_lies_between_the_thresholds(tmp_path):
+    np.testing.assert_array_equal(painted(tmp_path, SCALED, "scale"), [[0, 0, 47], [98, 100, 100]])
+    negated = painted(tmp_path, 255 - np.array(SCALED), "scale", SHEET.replace("negate: 0", "negate: true"))
+    np.testing.assert_array_equal(negated, [[0, 0, 47], [98, 100, 100]])
+
+
+def test_at_one_threshold_nothing_lies_between(tmp_path):
+    sheet = SHEET.replace("0.65", "0.2").replace("0.196", "0.2")
+    np.testing.assert_array_equal(painted(tmp_path, [[203, 204, 205]], "scale", sheet), [[100, 0, 0]])
+    np.testing.assert_array_equal(painted(tmp_path, [[203, 204, 205]], "trinary", sheet), [[100, UNKNOWN, 0]])
+
+
+def test_raw_is_the_picture_s_own_number(tmp_path):
+    cells = painted(tmp_path, [[0, 1, 99], [100, 101, 255]], "raw")
+    np.testing.assert_array_equal(cells, [[0, 1, 99], [100, UNKNOWN, UNKNOWN]])
+    assert cells.dtype == np.int8
+
+
+def test_colours_are_averaged(tmp_path):
+    pixels = [[[255, 255, 0], [0, 0, 255], [149, 150, 151]]]  # p = 0.333, 0.667, 0.412
+    np.testing.assert_array_equal(painted(tmp_path, pixels, "Trinary"), [[UNKNOWN, OCCUPIED, UNKNOWN]])
+    np.testing.assert_array_equal(painted(tmp_path, pixels, "scale"), [[29, OCCUPIED, 47]])
+
+
+@pytest.mark.parametrize("channels", [2, 4])
+def test_alpha_is_unknown_in_scale_and_a_colour_in_trinary(tmp_path, channels):
+    pixels = np.zeros((1, 4, channels), int)
+    pixels[0, :, :-1] = np.array([0, 0, 150, 255])[:, None]
+    pixels[0, :, -1] = [255, 254, 255, 0]
+    np.testing.assert_array_equal(painted(tmp_path, pixels, "scale"), [[OCCUPIED, UNKNOWN, 47, UNKNOWN]])
+    # The means over four channels are 63.75, 63.5, 176.25 and 191.25: p = 0.75, 0.751, 0.309 and 0.25.
+    np.testing.assert_array_equal(painted(tmp_path, pixels, "trinary"), [[OCCUPIED, OCCUPIED, UNKNOWN, UNKNOWN]])
+
+
+def test_pictures_of_other_depths(tmp_path):
+    np.testing.assert_array_equal(painted(tmp_path, [[True, False]], "trinary", dtype=bool), [[FREE, OCCUPIED]])
+    deep = np.array(SCALED) * 257
+    np.testing.assert_array_equal(painted(tmp_path, deep, "scale", dtype=np.uint16), [[0, 0, 47], [98, 100, 100]])
+    np.testing.assert_array_equal(painted(tmp_path, deep, "raw", dtype=np.uint16)[1], [90, 89, 0])
+    palette = Image.fromarray(np.array([[[255, 255, 255], [0, 0, 0], [150, 150, 150]]], np.uint8)).quantize(3)
+    palette.save(tmp_path / "map.png")
+    np.testing.assert_array_equal(load_map(tmp_path / "map.yaml").cells, [[UNKNOWN, 0, UNKNOWN]])  # the sheet is raw
+    two_bytes = b"P5\n3 1\n65535\n" + bytes([0, 0, 255, 255, 150, 150])
+    np.testing.assert_array_equal(load_map(written(tmp_path, picture=two_bytes)).cells, [[OCCUPIED, FREE, UNKNOWN]])
+
+
+@pytest.mark.parametrize(
+    "picture", [b"P2\n3 2\n255\n0 254 205\n100 205 205\n", b"P2 3 2 # made by hand\n10 0 10 8 4 8 8"]
+)
+def test_a_pgm_of_letters(tmp_path, picture):
+    np.testing.assert_array_equal(load_map(written(tmp_path, picture=picture)).cells[1], [OCCUPIED, FREE, UNKNOWN])
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "tif"])
+def test_pictures_of_other_formats(tmp_path, suffix):
+    Image.fromarray(np.frombuffer(GREYS, np.uint8).reshape(2, 3)).save(tmp_path / f"map.{suffix}")
+    (tmp_path / "map.yaml").write_text(SHEET.replace("pgm", suffix))
+    np.testing.assert_array_equal(load_map(tmp_path / "map.yaml").cells, load_map(written(tmp_path)).cells)
 
 
 def test_the_sheet_s_thresholds_decide(tmp_path):
@@ -152,7 +261,11 @@ def test_a_missing_field_is_named(tmp_path, field):
         ("0.5", ".nan", "resolution: expected metres per cell > 0"),
         ("negate: 0", "negate: maybe", "expected numbers"),
         ("0.65", "[1]", "expected numbers"),
-        ("image: map.pgm", "image: map.pgm\nmode: scale", "expected mode trinary, got scale"),
+        ("image: map.pgm", "image: map.pgm\nmode: binary", "expected mode trinary, scale or raw, got binary"),
+        ("image: map.pgm", "image: map.pgm\nmode:", "expected mode trinary, scale or raw, got None"),
+        ("image: map.pgm", "image:", "missing image"),
+        ("0.196", "0.7", "expected 0 <= free_thresh <= occupied_thresh <= 1, got 0.7, 0.65"),
+        ("0.65", ".nan", "expected 0 <= free_thresh <= occupied_thresh <= 1, got 0.196, nan"),
         ("image: map.pgm", "image: [", "expected a map_server YAML"),
         (SHEET, "", "expected the fields"),
         (SHEET, "- 1\n- 2\n", "expected the fields"),
@@ -182,17 +295,19 @@ def test_nothing_in_a_sheet_is_executed(tmp_path):
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        (b"P2\n3 2\n255\n" + GREYS, "binary 8-bit PGM"),
-        (b"P6\n3 2\n255\n" + GREYS, "binary 8-bit PGM"),
-        (b"P5\n3 2\n65535\n" + 2 * GREYS, "binary 8-bit PGM"),
-        (b"P5\n3 2\n", "binary 8-bit PGM"),
-        (b"P5\n3 two\n255\n" + GREYS, "binary 8-bit PGM"),
-        (b"P5\n# no end", "binary 8-bit PGM"),
-        (b"P5\n-3 2\n255\n" + GREYS, "binary 8-bit PGM"),
-        (b"", "binary 8-bit PGM"),
-        (b"P5\n3 2\n255\n" + GREYS[:-1], "expected 2 x 3 pixels, got 5 bytes"),
-        (b"P5\n3 2\n255\n" + GREYS + b"\n", "expected 2 x 3 pixels, got 7 bytes"),
-        (b"P5\n0 0\n255\n", "expected 0 x 0 pixels, got 0 bytes"),
+        (b"P2\n3 2\n255\n" + GREYS, "whole picture"),
+        (b"P2\n3 2\n255\n0 254 205", "whole picture"),
+        (b"P6\n3 2\n255\n" + GREYS, "whole picture"),
+        (b"P5\n3 2\n65535\n" + GREYS, "whole picture"),
+        (b"P5\n3 2\n", "expected a .*picture"),
+        (b"P5\n3 two\n255\n" + GREYS, "expected a .*picture"),
+        (b"P5\n# no end", "expected a .*picture"),
+        (b"P5\n-3 2\n255\n" + GREYS, "expected a .*picture"),
+        (b"", "expected a .*picture"),
+        (b"P5\n3 2\n255\n" + GREYS[:-1], "whole picture"),
+        (b"P5\n0 0\n255\n", "expected a .*picture"),
+        (b"P5\n20000 20000\n255\n", "whole picture .* decompression bomb"),
+        (b"Pf\n3 2\n-1.0\n" + bytes(24), "pixels of 8 or 16 bits, got Pillow's mode F"),
     ],
 )
 def test_a_damaged_picture_is_refused_by_name(tmp_path, picture, message):

@@ -8,13 +8,14 @@ from typing import Any
 from jaxlocmap.logs.carmen import read_carmen
 from jaxlocmap.logs.mrclam import read_mrclam
 from jaxlocmap.logs.record import Log
-from jaxlocmap.logs.timeline import Timeline, to_timeline
+from jaxlocmap.logs.timeline import MAX_GAP, Timeline, to_timeline
 from jaxlocmap.logs.trajectory import Pairs, Trajectory, pair, read_innovations, read_trajectory
 from jaxlocmap.logs.tum import write_tum
 from jaxlocmap.logs.woods import read_woods
 
 __all__ = [
     "FORMATS",
+    "MAX_GAP",
     "Log",
     "Pairs",
     "Timeline",

@@ -1,0 +1,164 @@
+"""Pauses, clocks that differ and stamps that fold: what becomes of time between the streams of a log."""
+
+import math
+import os
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxlocmap import logs
+
+
+def log_of(odometry, sightings=(), truth=(), scans=()):
+    """Stamps with a command each, stamps at which landmark 0 is seen, stamps of truth, stamps of scans."""
+    odometry = np.array(odometry, float).reshape(-1, 3)
+    return logs.Log(
+        name="made",
+        landmarks=np.zeros((1, 2)),
+        odometry_time=odometry[:, 0],
+        odometry=odometry[:, 1:],
+        sighting_time=np.array(sightings, float),
+        sighting_landmark=np.zeros(len(sightings), np.int32),
+        sighting=np.ones((len(sightings), 2)),
+        scan_time=np.array(scans, float),
+        scan=np.ones((len(scans), 1)),
+        beam_angles=np.zeros(1),
+        truth_time=np.array(truth, float),
+        truth=np.zeros((len(truth), 3)),
+    )
+
+
+DRIVE = [(0.0, 1.0, 0.1), (0.5, 1.1, 0.2), (1.0, 1.2, 0.3), (9.0, 1.3, 0.4), (9.5, 1.4, 0.5)]
+
+
+def test_in_a_gap_the_command_holds_for_a_period_and_then_the_robot_stands():
+    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE, sightings=[1.25, 4.0, 9.25]))
+    np.testing.assert_array_equal(time, [0, 0.5, 1, 1.25, 1.5, 4, 9, 9.25, 9.5])
+    np.testing.assert_array_equal(inputs.control[1:, 0], [1.0, 1.1, 1.2, 1.2, 0, 0, 1.3, 1.3])
+    np.testing.assert_array_equal(inputs.control[1:, 1], [0.1, 0.2, 0.3, 0.3, 0, 0, 0.4, 0.4])
+    np.testing.assert_array_equal(inputs.dt, np.diff(time, prepend=0.0))
+    np.testing.assert_array_equal(inputs.valid[:, 0], [0, 0, 0, 1, 0, 1, 0, 1, 0])
+    assert (counts["odometry_gaps"], counts["odometry_gap_seconds"]) == (1, 7.5)
+
+
+def test_after_the_last_command_the_robot_stands_too():
+    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE[:3], sightings=[1.25, 4.0], scans=[5.0]))
+    np.testing.assert_array_equal(time, [0, 0.5, 1, 1.25, 1.5, 4, 5])
+    np.testing.assert_array_equal(inputs.control[1:, 0], [1.0, 1.1, 1.2, 1.2, 0, 0])
+    assert (counts["odometry_gaps"], counts["odometry_gap_seconds"]) == (1, 3.5)
+
+
+@pytest.mark.parametrize("max_gap", [8.0, math.inf])
+def test_up_to_the_limit_a_command_holds(max_gap):
+    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE, sightings=[4.0]), max_gap=max_gap)
+    np.testing.assert_array_equal(time, [0, 0.5, 1, 4, 9, 9.5])
+    np.testing.assert_array_equal(inputs.control[1:, 0], [1.0, 1.1, 1.2, 1.2, 1.3])
+    assert (counts["odometry_gaps"], counts["odometry_gap_seconds"]) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "time", "speeds", "seconds"),
+    [
+        (1.1, 6.0, [1.25, 1.5, 4], [1.2, 0], 2.5),
+        (2.0, None, [4, 9, 9.25, 9.5], [0, 1.3, 1.3], 5),
+        (None, 1.4, [0, 0.5, 1, 1.25], [1, 1.1, 1.2], 0),
+        (9.0, None, [9, 9.25, 9.5], [1.3, 1.3], 0),
+    ],
+)
+def test_only_the_gaps_between_start_and_stop_count(start, stop, time, speeds, seconds):
+    log = log_of(DRIVE, sightings=[1.25, 4.0, 9.25])
+    timeline = logs.to_timeline(log, start=start, stop=stop)
+    np.testing.assert_array_equal(timeline.time, time)
+    np.testing.assert_array_equal(timeline.inputs.control[1:, 0], speeds)
+    assert timeline.counts["odometry_gap_seconds"] == seconds
+    assert timeline.counts["odometry_gaps"] == (seconds > 0)
+
+
+def test_odometry_slower_than_the_limit_is_refused():
+    slow = log_of([(2 * t, 1, 0) for t in range(5)])
+    with pytest.raises(ValueError, match=r"made: odometry: expected stamps at most max_gap = 1.5 s .* 2.000 s apart"):
+        logs.to_timeline(slow)
+    assert logs.to_timeline(slow, max_gap=2).counts["odometry_gaps"] == 0
+
+
+def test_one_command_holds_as_long_as_the_limit():
+    time, inputs, _, _, counts = logs.to_timeline(log_of([(0, 1, 0)], sightings=[1, 5]), max_gap=2)
+    np.testing.assert_array_equal(time, [0, 1, 2, 5])
+    np.testing.assert_array_equal(inputs.control[1:, 0], [1, 1, 0])
+    assert counts["odometry_gap_seconds"] == 3
+
+
+def test_gaps_of_the_truth_count_where_steps_lie_in_them():
+    log = log_of([(t / 4, 0, 0) for t in range(40)], truth=[1, 2, 5, 6, 6.1, 8, 9.6, 12])
+    timeline = logs.to_timeline(log)
+    # From 2 to 5, 6.1 to 8, 8 to 9.6; of the last only the part before 9.75, where the steps end, has steps.
+    assert timeline.counts["truth_gaps"] == 4
+    assert logs.to_timeline(log, max_gap=2).counts["truth_gaps"] == 2
+    assert logs.to_timeline(log, start=7.9, stop=9.5).counts["truth_gaps"] == 1
+    known = {t for t in timeline.time if 1 <= t <= 2 or 5 <= t <= 6.1 or t == 8}
+    assert set(timeline.time[timeline.truth_valid]) == known
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        ([5000, 5001], "truth from 5000.000 to 5001.000 s, odometry from 0.000 to 9.500 s"),
+        ([-0.1, -5], "truth from -5.000 to -0.100 s, odometry from"),
+        ([9.6], "truth from 9.600 to 9.600 s"),
+    ],
+)
+def test_clocks_that_differ_are_told_with_both_spans(truth, said):
+    with pytest.raises(ValueError, match=f"made: truth and odometry: no overlap in time: {said}"):
+        logs.to_timeline(log_of(DRIVE, truth=truth), start=min(truth))
+
+
+def test_streams_that_touch_overlap():
+    assert logs.to_timeline(log_of(DRIVE, truth=[9.5, 12])).truth_valid.sum() == 1
+    assert logs.to_timeline(log_of(DRIVE, truth=[-1, 0])).truth_valid.sum() == 1
+
+
+# --- Small logs on disk ---
+
+
+@pytest.fixture(scope="module")
+def localized(tmp_path_factory):
+    """Runs the program on a case, in this process, and keeps its report."""
+    root = os.environ.get("JAXLOCMAP_DATA")
+    if not root:
+        pytest.skip("JAXLOCMAP_DATA does not name a folder with the real logs")
+    sys.path.append(str(Path(__file__).parent.parent / "experiments"))
+    import localize
+
+    def report(case, **settings):
+        folder = Path(root).parent / "cases" / case
+        with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+            out = tmp_path_factory.mktemp("out")
+            return localize.main(localize.LocalizeConfig(folder, "mrclam", robot=1, out=out, **settings))
+
+    return report
+
+
+def test_a_pause_of_ten_seconds_costs_nothing(localized):
+    plain, paused = localized("mrclam_nogap"), localized("mrclam_gap10")
+    assert abs(plain["rmse_position_m"] - 0.063) < 5e-4
+    assert abs(paused["rmse_position_m"] - 0.063) < 5e-4
+    assert (paused["counts"]["odometry_gaps"], paused["counts"]["odometry_gap_seconds"]) == (1, 10)
+    assert plain["counts"]["odometry_gaps"] == plain["counts"]["truth_gaps"] == 0
+    assert localized("mrclam_gap10", max_gap=20.0)["rmse_position_m"] > 1
+
+
+def test_a_truth_clock_that_is_off(localized):
+    with pytest.raises(ValueError, match=r"no overlap in time: truth from 1248005000.000 .* odometry from 1248000000"):
+        localized("mrclam_clock_off")
+    with pytest.raises(ValueError, match="no overlap in time"):
+        localized("mrclam_clock_off", start=(0.0, 0.0, 0.0))
+
+
+def test_too_little_truth_is_counted(localized, capsys):
+    assert localized("mrclam_truth_3_steps")["counts"]["duplicate_truth"] == 0
+    capsys.readouterr()
+    assert localized("mrclam_truth_7_digits")["counts"]["duplicate_truth"] == 1199
+    assert "1,199 of 1,200 stamps of the truth repeat another" in capsys.readouterr().out
