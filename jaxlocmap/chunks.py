@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxpr_as_fun, jaxprs_in_params
+from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -22,93 +22,70 @@ from jaxlocmap import batching
 class Limits(NamedTuple):
     """What one device should be given. Constants, so that machines choose the same chunk for a long study."""
 
-    working: int  # bytes that the loops of a chunk touch at every turn
-    resident: int  # bytes that a chunk holds for as long as it runs
+    working: int  # bytes that the loop of a chunk touches at every turn
+    resident: int  # bytes that a chunk holds while it runs
     most: int  # runs
 
 
 # Some L2 caches (a scan touches a small part of a map); an eighth of 2 GiB a core; enough runs that what it costs to
 # start a kernel is little beside what it does.
 CPU = Limits(working=8 * 2**20, resident=256 * 2**20, most=3000)
-ACCELERATOR = Limits(working=2 * 2**30, resident=4 * 2**30, most=2**16)  # what counts there is to be wide
+ACCELERATOR = Limits(working=2 * 2**30, resident=4 * 2**30, most=2**20)  # what counts there is to be wide
 _LEAST = 8  # runs: the lanes of a vector register
 _FEW_TURNS = 8
 _PAGES = 512  # runs: where these divide a chunk, its arrays lie whole pages apart and push each other out of the cache
 
 
-class RunBytes(NamedTuple):
-    """What one run needs, by its shapes alone: before the compiler fuses anything."""
-
-    working: int  # carry of the hungriest loop and the largest value its body makes; without loops, the largest value
-    resident: int  # most that is alive at once outside loops, the stacked results of loops among it
-
-
-def run_bytes(jaxpr: Any) -> RunBytes:
-    """Bytes of one run, from its `ClosedJaxpr`."""
-    largest, loop, peak = _walk(jaxpr)
-    return RunBytes(loop or largest, peak)
+def limits_of(device: Any) -> Limits:
+    """Those of a device; where it says how much memory it has, a chunk may hold a quarter of that."""
+    if device.platform == "cpu":
+        return CPU
+    stats = device.memory_stats() or {}
+    return ACCELERATOR._replace(resident=stats.get("bytes_limit", 4 * ACCELERATOR.resident) // 4)
 
 
-def _walk(jaxpr: Any) -> tuple[int, int, int]:
-    """Bytes of the largest value, of the hungriest loop, and of all values alive at once outside loops."""
-    jaxpr = getattr(jaxpr, "jaxpr", jaxpr)
-    last = {id(used): k for k, equation in enumerate(jaxpr.eqns) for used in equation.invars}
-    last |= {id(result): len(jaxpr.eqns) for result in jaxpr.outvars}
-    dying: dict[int, int] = {}  # bytes that are used for the last time by an equation
-    summed = _summed(jaxpr)
-    largest = loop = alive = peak = 0
-    for k, equation in enumerate(jaxpr.eqns):
-        made = {
-            id(out): 0 if id(out) in summed else math.prod(out.aval.shape) * out.aval.dtype.itemsize
-            for out in equation.outvars
-        }
-        inside = [_walk(inner) for inner in jaxprs_in_params(equation.params)]
-        if equation.primitive.name in ("scan", "while"):
-            carry = sum(list(made.values())[: equation.params.get("num_carry")])  # of a `while`, all it makes
-            loop = max([loop, *(carry + max(inner[:2]) for inner in inside)])
-            inside = []
-        largest = max([largest, *made.values(), *(inner[0] for inner in inside)])
-        loop = max([loop, *(inner[1] for inner in inside)])
-        peak = max([peak, alive + sum(made.values()), *(alive + inner[2] for inner in inside)])
-        for out, size in made.items():
-            if out in last:
-                dying[last[out]] = dying.get(last[out], 0) + size
-                alive += size
-        alive -= dying.pop(k, 0)
-    return largest, loop, peak
-
-
-def _summed(jaxpr: Any) -> set[int]:
-    """The values that are sums over the runs of a chunk, so that a run has no part in their bytes."""
-    summed = set[int]()
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "psum":
-            summed |= {id(out) for out in equation.outvars}
-        if equation.primitive.name == "scan":
-            body = equation.params["jaxpr"].jaxpr
-            inside = _summed(body)
-            stacked = zip(equation.outvars, body.outvars, strict=True)
-            summed |= {id(out) for out, within in stacked if id(within) in inside}
-    return summed
-
-
-def from_shapes(jaxpr: Any, runs: int, devices: int, platform: str) -> int:
-    """The chunk for a run that is traced to `jaxpr`.
-
-    A multiple of 8 whose loops work inside the cache and whose values take little of the memory. It depends on the
-    shapes and on whether the device is a CPU alone, unless `runs` are so few that `devices` would take no more than 8
-    turns: then the turns are made of equal size, so that no device waits for a last odd chunk, and another number of
-    runs may be another chunk, which is compiled anew.
+def foreseen(run: OneRun, limits: Limits) -> int:
+    """The most runs whose loop works inside the cache, by what the run says that its loop carries; `limits.most` where
+    it says nothing.
     """
-    limits = CPU if platform == "cpu" else ACCELERATOR
-    need = run_bytes(jaxpr)
-    fit = min(limits.most, limits.working // max(need.working, 1), limits.resident // max(need.resident, 1))
+    carried = getattr(run.function, "carried", None)
+    if carried is None:
+        return limits.most
+    key, args = jax.tree.unflatten(run.structure, run.leaves)
+    size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(jax.eval_shape(carried, key, *args)))
+    return min(limits.most, limits.working // max(2 * size, 1))  # a turn reads one carry and writes the next
+
+
+def even(fit: int, runs: int, devices: int) -> int:
+    """The chunk where `fit` runs are the most: a multiple of 8 that depends on nothing else, unless `runs` are so few
+    that `devices` would take no more than 8 turns. Then the turns are made of equal size, so that no device waits for
+    a last odd chunk, and another number of runs may be another chunk, which is compiled anew.
+    """
     chunk = max(fit // _LEAST, 1) * _LEAST
     turns = -(-runs // (chunk * devices))
     if turns > _FEW_TURNS:
         return chunk
     chunk = -(-runs // (turns * devices))
     return chunk + _LEAST if chunk % _PAGES == 0 else chunk
+
+
+def choose(run: OneRun, runs: int, count: int, devices: tuple[Any, ...]) -> int:
+    """The chunk for so many runs on `count` devices of all processes, `devices` of them here.
+
+    What the run says is taken, compiled, and taken again smaller where the program holds more than it should: so one
+    compilation does for a run that says what its loop carries, or that needs little.
+    """
+    limits = limits_of(devices[0])
+    fit = foreseen(run, limits)
+    while True:
+        chunk = even(fit, runs, count)
+        try:
+            need = compile(run, chunk, devices).need
+        except ValueError:  # more than the compiler itself takes
+            need = 16 * limits.resident
+        if need <= limits.resident or chunk <= _LEAST:
+            return chunk
+        fit = min(chunk * limits.resident // need, chunk // 2)
 
 
 class OneRun(NamedTuple):
@@ -192,12 +169,57 @@ def lowered_text(run: OneRun) -> str:
 class Program(NamedTuple):
     """A chunk on each of some devices, compiled."""
 
-    compute: Callable[..., list[jax.Array]]  # (first run of each device's chunk, runs, key, args) -> arrays
+    run: Callable[..., list[jax.Array]]  # (first run of each device's chunk, runs, key, args) -> arrays
+    chunk: int
     mesh: Mesh  # the devices
+    need: int  # bytes that it holds on each device while it runs; 0 where the compiler does not say
 
     def place(self, values: Any) -> Any:
         """Put what all runs share on the devices, once."""
         return jax.device_put(values, NamedSharding(self.mesh, P()))
+
+    def compute(self, first: np.ndarray, *others: Any) -> list[np.ndarray]:
+        """The arrays of a turn.
+
+        Raises:
+            ValueError: it does not fit into memory.
+        """
+        with _refused(self.chunk, self.mesh.size):
+            return [np.asarray(x) for x in self.run(first, *others)]
+
+    def check_memory(self) -> None:
+        """Refuse to need more memory than there is, before it starts.
+
+        Raises:
+            ValueError: it does; the message says what it needs and what would fit.
+        """
+        device, devices = self.mesh.devices.flat[0], self.mesh.size
+        available = _available(device)
+        need = self.need * (devices if device.platform == "cpu" else 1)  # these share the machine's memory
+        if available is not None and need > available:
+            raise ValueError(
+                f"chunk: expected one that fits into the memory, got {self.chunk} runs on each of {devices} devices, "
+                f"which need about {need / 1e9:,.1f} GB of {available / 1e9:,.1f} GB; about "
+                f"{int(self.chunk * available / need)} fit"
+            )
+
+
+@contextlib.contextmanager
+def _refused(chunk: int, devices: int) -> Iterator[None]:
+    """Where a device runs out of memory, the same kind of error as where that is known before.
+
+    Raises:
+        ValueError: it does.
+    """
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise ValueError(
+            f"chunk: expected one that fits into the memory, got {chunk} runs on each of {devices} devices: "
+            f"{str(error).splitlines()[0]}"
+        ) from None
 
 
 @functools.lru_cache(maxsize=64)
@@ -208,7 +230,7 @@ def compile(run: OneRun, chunk: int, devices: tuple[Any, ...]) -> Program:
     array (devices, chunk, ...) a leaf. Runs from index `runs` on are past the end and not counted.
 
     Raises:
-        ValueError: it does not fit into memory.
+        ValueError: the compiler runs out of memory.
     """
     compute = _chunk(run, chunk)
     key, args = jax.tree.unflatten(run.structure, run.leaves)
@@ -222,31 +244,11 @@ def compile(run: OneRun, chunk: int, devices: tuple[Any, ...]) -> Program:
         on_device, mesh=mesh, in_specs=(P("devices"), P(), P(), P()), out_specs=P("devices"), check_vma=False
     )
     first, runs = jax.ShapeDtypeStruct((len(devices),), np.int32), jax.ShapeDtypeStruct((), np.int32)
-    compiled = jax.jit(sharded).lower(first, runs, key, args).compile()
-    check_memory(compiled, chunk, devices)
-    return Program(compiled, mesh)
-
-
-def check_memory(compiled: Any, chunk: int, devices: Sequence[Any]) -> None:
-    """Refuse a program that needs more memory than there is, before it starts.
-
-    Args:
-        compiled: of `chunk` runs on each of `devices`.
-
-    Raises:
-        ValueError: it does not fit; the message says what it needs and what would fit.
-    """
-    analysis, available = compiled.memory_analysis(), _available(devices[0])
-    if analysis is None or available is None:
-        return
-    need = analysis.temp_size_in_bytes + analysis.output_size_in_bytes + analysis.argument_size_in_bytes
-    if devices[0].platform == "cpu":  # the devices share the machine's memory
-        need *= len(devices)
-    if need > available:
-        raise ValueError(
-            f"chunk: expected one that fits into the memory, got {chunk} runs on each of {len(devices)} devices, which "
-            f"need about {need / 1e9:,.1f} GB of {available / 1e9:,.1f} GB; about {int(chunk * available / need)} fit"
-        )
+    with _refused(chunk, len(devices)):
+        compiled = jax.jit(sharded).lower(first, runs, key, args).compile()
+    sizes = compiled.memory_analysis()
+    need = sizes.temp_size_in_bytes + sizes.output_size_in_bytes + sizes.argument_size_in_bytes if sizes else 0
+    return Program(compiled, chunk, mesh, need)
 
 
 def _available(device: Any) -> int | None:

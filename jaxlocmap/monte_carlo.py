@@ -62,11 +62,13 @@ def monte_carlo(
             frozen dataclass), so that the same study is compiled once. It may have a method
             `summed(key, counted, *args)` that returns the sum over the runs that are counted, by
             `batching.sum_over_runs`: then sums come from that, and a run need not hold what is added up on the way.
+            It may also have a method `carried(key, *args)` that returns what its loop over time carries, of which
+            nothing but the shapes is looked at: a chunk is then made to work inside the cache.
         key: of the whole study. runs: how many, >= 1.
         *args: pytrees of arrays handed to every run: parameters, the world. Changing their values compiles nothing.
         chunk: runs that a device computes at once. Memory grows with it, not with `runs`. By default that of the
-            study to resume, else chosen from the shapes by `chunks.from_shapes`: the same everywhere, unless the runs
-            make few turns of the devices, which are then made equal.
+            study to resume, else chosen by `chunks.choose`: the same in all processes, and on all machines for a run
+            that says what its loop carries, unless the runs make few turns of the devices, which are then made equal.
         keep_runs: return each run's own values instead of their sums; in one process only.
         devices: of `jax.local_devices()`, all by default.
         progress: called with the number of runs done after each turn of the devices; in several processes, as if the
@@ -100,7 +102,10 @@ def monte_carlo(
     args, platform = jax.tree.map(jnp.asarray, args), devices[0].platform
     run = chunks.OneRun.of(one_run, keep_runs, key, args)
     traced = chunks.trace(run)
-    split = Split(runs, int(chosen[0]) or chunks.from_shapes(traced.jaxpr, runs, int(counts.sum()), platform))
+    chunk = int(chosen[0])
+    if not chunk:  # compilers on different machines may foresee different needs
+        chunk = int(hosts.gather(np.array(chunks.choose(run, runs, int(counts.sum()), devices), np.int32)).min())
+    split = Split(runs, chunk)
     study: dict[str, Any] = {}
     if parts is not None or processes > 1:
         study = manifest(split, chunks.lowered_text(run), key, args, keep_runs=keep_runs, platform=platform)
@@ -108,6 +113,7 @@ def monte_carlo(
     if parts is not None:
         hosts.in_turn(lambda: parts.check(study))
     program = chunks.compile(run, split.chunk, devices)
+    program.check_memory()
     compile_s = time.perf_counter() - began if chunks.compile.cache_info().misses > compiled else 0.0
 
     own, finished = range(process, split.parts, processes), set[int]()
@@ -156,7 +162,7 @@ def _compute(
     while turn := list(itertools.islice(todo, devices)):
         idle = [0] * (devices - len(turn))  # what these devices compute is not looked at
         first = np.array([each * split.chunk for each in turn] + idle, np.int32)
-        arrays = map(np.asarray, program.compute(first, runs, *shared))
+        arrays = program.compute(first, runs, *shared)
         yield from itertools.islice(zip(*arrays, strict=True), len(turn))
         done += sum(split.runs_in(range(each, each + 1)) for each in turn)
         report(done)

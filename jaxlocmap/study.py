@@ -34,7 +34,7 @@ from jaxlocmap.scoring import (
     score_step,
 )
 from jaxlocmap.stages import correct, map_scan, predict, sound
-from jaxlocmap.types import Config, Gaussian, Params
+from jaxlocmap.types import Config, Gaussian, Params, State
 from jaxlocmap.world import World
 
 __all__ = ["MapTotals", "Study", "Totals", "summarise"]
@@ -146,6 +146,17 @@ class Study:
             key, *args, **kwargs: as of a call.
         """
         return self(key, *args, **kwargs, add_up=functools.partial(sum_over_runs, counted=counted))
+
+    def carried(
+        self, key: jax.Array, params: Params, world: World, noise: simulate.Noise, prior: Gaussian, *_: Any
+    ) -> State:
+        """What fills memory in the loop over time: the state of the filter, whose map outweighs all else.
+
+        Args:
+            key, params, world, noise, prior: as of a call.
+        """
+        del key, params, world, noise
+        return init(prior, config=self.config)
 
 
 def _mean_over_runs(total_and_square: np.ndarray, runs: int, expected: float) -> consistency.Mean:
