@@ -4,77 +4,23 @@ params.json, the evidence on what was held out, and how sure it all is.
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import optax
 from common import CONSOLE, command_line, output_folder, saved, write_report
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
-from tune_sources import JUDGE_GATE, TUNING_GATE, Source, Wanted, from_robots, from_scans, from_scenario
+from tune_options import TuneConfig, checked, loss_weights, tuned_parameters
+from tune_sources import Source, Wanted, from_robots, from_scans, from_scenario
 
 from jaxlocmap import Params, hosts, plotting, tuning
 from jaxlocmap.consistency import readable
 
-
-@dataclasses.dataclass(frozen=True)
-class TuneConfig:
-    """What to tune, on what, and what for."""
-
-    scenario: Literal["capstone", "loop"] = "capstone"
-    """Simulated drives to tune on, unless there is a log."""
-    log: Path | None = None
-    """A log to tune on: a file for woods and carmen, a folder for mrclam."""
-    format: Literal["woods", "mrclam", "carmen"] | None = None
-    """How the log is written."""
-    robots: tuple[int, ...] = (1, 2, 3)
-    """Which robots of an mrclam log to tune on."""
-    judged: tuple[int, ...] = (4, 5)
-    """Which robots of an mrclam log to judge the result by."""
-    loss: tuple[str, ...] = ("innovation",)
-    """innovation, pose, state, nees, nis, map; several with weights: pose=1 nees=0.5."""
-    tune: tuple[str, ...] | None = None
-    """Which of v, w, v_w, range, bearing, range_bearing, l_occ, l_free; by default what the losses depend on, with Q
-    and R diagonal."""
-    full: bool = False
-    """Q and R with their correlations."""
-    params: Path | None = None
-    """JSON file to start from; by default the course's values, what the log states, or what fits the format."""
-    motion: Literal["arc", "euler", "capstone"] = "arc"
-    """The filter's motion model."""
-    runs: int = 512
-    """Simulated runs to tune on."""
-    judge_runs: int = 2000
-    """Fresh runs to judge by."""
-    gate: float | None = TUNING_GATE
-    """The gate while tuning, which weighs readings instead of deciding. It is for what is surely false: one that also
-    refuses a good reading in a hundred pulls the result by some per cent."""
-    judge_gate: float | None = JUDGE_GATE
-    """The gate the result is judged with."""
-    max_range: float | None = None
-    """Sightings at or beyond are left out, m; of a laser, where its beams end (20 m by default)."""
-    resolution: float = 0.1
-    """Side of a cell of a carmen log's map, m."""
-    optimiser: Literal["lbfgs", "adam"] = "lbfgs"
-    """L-BFGS on everything at every step, or Adam, which also goes with --minibatch."""
-    minibatch: int | None = None
-    """Sequences a step of Adam; all by default."""
-    epochs: int = 20
-    """At most so many; after each the loss on sequences left aside is taken."""
-    seed: int = 0
-    """Of all randomness."""
-    out: Path = Path("out/tune")
-    """Folder for params.json, report.json and the figures."""
-    quick: bool = False
-    """A run of a few seconds."""
-
-
-_DEPENDS = {"map": tuning.SENSOR_MODEL}
 _STEPS = {"lbfgs": 2, "adam": 20}  # an epoch
 _LOSS_WORDS = {
     "innovation": "negative log-likelihood of an innovation, nats",
@@ -89,15 +35,16 @@ _LOSS_WORDS = {
 def main(config: TuneConfig) -> dict[str, Any]:
     """Tune, judge before and after, write the parameters, the report and the figures."""
     began = time.perf_counter()
+    config = checked(config)
     out = output_folder(config.out)
-    weights = _weights(config.loss)
+    weights = loss_weights(config)
     losses = tuple(name for name, _ in weights)
     hosts.use_all_cores()
     jax.config.update("jax_disable_most_optimizations", config.quick)  # a quick run does little but compile
     with jax.enable_x64(True):
         source = _source(config, losses)
         objective = tuning.Objective(source.config, weights)
-        tuned = _tuned(config, losses)
+        tuned = tuned_parameters(config)
         CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds", highlight=False)
         found = _fit(config, objective, source, tuned, out)
         descent = {"source": source.name, "losses": dict(weights), **_descent(config, losses, found)}
@@ -122,61 +69,27 @@ def main(config: TuneConfig) -> dict[str, Any]:
     return report
 
 
-def _source(config: TuneConfig, losses: tuple[str, ...]) -> Source:
+def _source(config: Any, losses: tuple[str, ...]) -> Source:
+    """Of a config with its defaults filled in, whose fields the type checker takes for None."""
     start = None if config.params is None else Params.load(config.params)
-    wanted = Wanted(losses, start, config.gate, config.judge_gate, config.seed, config.quick)
-    if (config.log is None) != (config.format is None):
-        raise ValueError(f"log, format: expected both or neither, got {config.log} and {config.format}")
+    wanted = Wanted(losses, start, config.gate, config.judge_gate, config.seed, config.quick, config.max_gap)
     if config.log is None:
-        for name in ("runs", "judge_runs"):
-            if getattr(config, name) < 2:
-                raise ValueError(f"{name}: expected at least 2, got {getattr(config, name)}")
-        runs, judge_runs = (32, 100) if config.quick else (config.runs, config.judge_runs)
-        return from_scenario(config.scenario, config.motion, runs, judge_runs, wanted)
+        return from_scenario(config.scenario, config.motion, config.runs, config.judge_runs, wanted)
     if config.format == "carmen":
-        return from_scans(config.log, config.resolution, config.max_range or 20.0, wanted)
-    if "map" in losses:
-        raise ValueError(f"loss: expected none of a map, for the format {config.format} has no scans, got `map`")
+        return from_scans(config.log, config.resolution, config.max_range, wanted)
     kind, robots = str(config.format), config.robots
     return from_robots(config.log, kind, robots, config.judged, config.motion, config.max_range, wanted)
 
 
-def _weights(losses: tuple[str, ...]) -> tuple[tuple[str, float], ...]:
-    weights = []
-    for loss in losses:
-        name, _, weight = loss.partition("=")
-        try:
-            weights.append((name, float(weight or 1)))
-        except ValueError:
-            raise ValueError(f"loss: expected NAME or NAME=WEIGHT, got {loss!r}") from None
-    return tuple(weights)
-
-
-def _tuned(config: TuneConfig, losses: tuple[str, ...]) -> tuple[str, ...]:
-    if config.tune is not None:
-        return config.tune
-    noise = tuning.FULL_NOISE if config.full else tuning.NOISE
-    names = [name for loss in losses for name in _DEPENDS.get(loss, noise)]
-    return tuple(name for name in tuning.NAMES if name in names)
-
-
-def _fit(
-    config: TuneConfig, objective: tuning.Objective, source: Source, tuned: tuple[str, ...], out: Path
-) -> tuning.Fit:
-    adam = config.optimiser == "adam"
-    if config.minibatch is not None and not adam:
-        raise ValueError(
-            f"minibatch: L-BFGS wants everything at every step: expected --optimiser adam, got {config.optimiser}"
-        )
-    epochs = min(config.epochs, 2) if config.quick else config.epochs
-    with _bar(epochs, tuned, out) as progress:
+def _fit(config: Any, objective: tuning.Objective, source: Source, tuned: tuple[str, ...], out: Path) -> tuning.Fit:
+    with _bar(config.epochs, tuned, out) as progress:
         return tuning.fit(
             objective,
             source.start,
             source.train,
             tuned=tuned,
-            optimiser=optax.adam(0.05) if adam else None,
-            epochs=epochs,
+            optimiser=optax.adam(0.05) if config.optimiser == "adam" else None,
+            epochs=config.epochs,
             steps=_STEPS[config.optimiser],
             minibatch=config.minibatch,
             key=jax.random.key(config.seed),

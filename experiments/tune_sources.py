@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import scenario_of
-from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of, prior_at
+from common import CONSOLE, scenario_of
+from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of, prior_at, time_sentences
 from map_log import first_scans, ready, say_doubts
 
 from jaxlocmap import Config, Gaussian, Params, simulate, tuning
 from jaxlocmap.foresight import Foresight
-from jaxlocmap.logs import Log, Timeline, read, to_timeline
+from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.study import Study, summarise
 from jaxlocmap.world import random_room
@@ -57,6 +57,7 @@ class Wanted:
     judge_gate: float | None
     seed: int
     quick: bool
+    max_gap: float = MAX_GAP  # s
 
 
 def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wanted) -> Source:
@@ -116,7 +117,7 @@ def from_robots(
 ) -> Source:
     """Logs of robots among landmarks. woods: the first half to tune on, the second to judge. mrclam: whole robots."""
     if kind == "woods":
-        log, timeline = _timeline(path, kind, None, max_range, wanted.quick)
+        log, timeline = _timeline(path, kind, None, max_range, wanted)
         half = len(timeline.time) // 2
         drives = [(log, _cut(timeline, 0, half))]
         held_out = {"second half": (log, _from_truth(_cut(timeline, half, None)))}
@@ -125,10 +126,10 @@ def from_robots(
             raise ValueError(
                 f"robots, judged: expected robots to tune on and others to judge, got {robots} and {judged}"
             )
-        drives = [_timeline(path, kind, robot, max_range, wanted.quick) for robot in robots]
-        held_out = {f"robot {robot}": _timeline(path, kind, robot, max_range, wanted.quick) for robot in judged}
+        drives = [_timeline(path, kind, robot, max_range, wanted) for robot in robots]
+        held_out = {f"robot {robot}": _timeline(path, kind, robot, max_range, wanted) for robot in judged}
     log = drives[0][0]
-    reach = max_range or Config.max_range
+    reach = Config.max_range if max_range is None else max_range
     filter_config = Config(dt=PERIOD, motion=motion, sensor_offset=offset_of(log.sensor_offset), max_range=reach)
     config = _tuning(dataclasses.replace(filter_config, gate_probability=wanted.gate))
     start = wanted.start or believed(log)
@@ -149,8 +150,6 @@ def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) 
     """A laser log with poses: the first half of the scans to tune on, of which every fifth run of scans picks the best,
     the second half to judge, mapped onto what the first has left.
     """
-    if wanted.losses != ("map",):
-        raise ValueError(f"loss: a carmen log has no landmarks: expected `map` alone, got {', '.join(wanted.losses)}")
     log = read(path, "carmen")
     scans = min(len(log.scan), 60) if wanted.quick else len(log.scan)
     log = first_scans(log, scans)
@@ -188,14 +187,18 @@ def _scans(log: Log, count: int) -> tuning.Batch:
     return tuning.sequence(inputs, prior, beam_angles=log.beam_angles, poses=log.truth[:count])
 
 
-def _timeline(path: Path, kind: str, robot: int | None, max_range: float | None, quick: bool) -> tuple[Log, Timeline]:
+def _timeline(
+    path: Path, kind: str, robot: int | None, max_range: float | None, wanted: Wanted
+) -> tuple[Log, Timeline]:
     log = read(path, kind, robot)
     if not len(log.landmarks):
         raise ValueError(f"{path}: expected landmarks to localise by, got none (format {kind})")
     if not len(log.truth_time):
         raise ValueError(f"{path}: expected a log with truth, to start from, to judge by and for some losses, got none")
-    timeline = to_timeline(log, max_range=max_range, start=float(log.truth_time.min()))
-    return log, _cut(timeline, 0, 6000 if kind == "mrclam" else 2400) if quick else timeline
+    timeline = to_timeline(log, max_range=max_range, start=float(log.truth_time.min()), max_gap=wanted.max_gap)
+    for sentence in time_sentences(log, timeline.counts, wanted.max_gap):
+        CONSOLE.print(f"careful: {log.name}: {sentence}", highlight=False)
+    return log, _cut(timeline, 0, 6000 if kind == "mrclam" else 2400) if wanted.quick else timeline
 
 
 def _cut(timeline: Timeline, begin: int, end: int | None) -> Timeline:

@@ -1,6 +1,9 @@
 """The tuning program: what it writes, and what it says to a mistake."""
 
 import json
+import math
+import os
+import re
 import sys
 from pathlib import Path
 
@@ -12,6 +15,10 @@ from jaxlocmap import Params
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import tune
+
+WOODS = {"log": Path("nowhere"), "format": "woods"}
+MRCLAM = {"log": Path("nowhere"), "format": "mrclam"}
+CARMEN = {"log": Path("nowhere"), "format": "carmen", "loss": ("map",)}
 
 
 @pytest.fixture(autouse=True)
@@ -59,11 +66,80 @@ def test_simulated_drives(tmp_path):
         ({"log": Path("nowhere"), "format": "mrclam", "judged": ()}, "expected robots to tune on and others to judge"),
         ({"log": Path("nowhere"), "format": "mrclam", "loss": ("map",)}, "the format mrclam has no scans, got `map`"),
         ({"runs": 1}, "runs: expected at least 2, got 1"),
+        ({"runs": 5.0}, "runs: expected a whole number, got 5.0"),
+        ({"judge_runs": 0}, "judge_runs: expected at least 2"),
+        ({"epochs": 0}, "epochs: expected at least 1"),
+        ({"minibatch": 0, "optimiser": "adam"}, "minibatch: expected at least 1"),
+        ({"gate": 1.0}, "gate: expected a probability inside (0, 1), or None for no gate, got 1.0"),
+        ({"judge_gate": math.nan}, "judge_gate: expected a probability"),
+        ({"loss": ("pose=0",)}, "loss: expected each once, with a positive weight, got pose=0"),
+        ({"loss": ("pose=nan",)}, "loss: expected each once, with a positive weight"),
+        ({"loss": ("pose=",)}, "loss: expected NAME or NAME=WEIGHT, got 'pose='"),
+        ({"loss": ("pose", "pose=2")}, "loss: expected each once"),
+        ({"loss": ()}, "loss: expected at least one"),
+        ({"full": True, "tune": ("v",)}, "full: applies where Q and R are tuned and --tune is not given"),
+        ({"full": True, "loss": ("map",)}, "full: applies where"),
+        (MRCLAM | {"robots": (1, 1)}, "robots: expected each robot once, got (1, 1)"),
+        (MRCLAM | {"max_range": -1.0}, "max_range: expected metres > 0, finite, got -1.0"),
+        (MRCLAM | {"max_gap": 0.0}, "max_gap: expected seconds > 0, finite, got 0.0"),
+        (CARMEN | {"max_range": 0.0}, "max_range: expected metres > 0, finite, got 0.0"),
+        (CARMEN | {"max_range": math.nan}, "max_range: expected metres > 0, finite, got nan"),
+        (CARMEN | {"max_range": math.inf}, "max_range: expected metres > 0, finite, got inf"),
+        (CARMEN | {"resolution": 0.0}, "resolution: expected metres > 0, finite, got 0.0"),
+        (CARMEN | {"resolution": math.nan}, "resolution: expected metres > 0, finite, got nan"),
     ],
 )
 def test_a_mistake_is_named(tmp_path, settings, expected):
-    with pytest.raises(ValueError, match=expected.replace("(", r"\(")):
+    with pytest.raises(ValueError, match=re.escape(expected)):
         tuned(tmp_path, **settings)
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "value", "applies"),
+    [
+        ({}, "max_range", 20.0, "woods and mrclam and carmen, not to a scenario"),
+        ({}, "max_gap", 1.5, "woods and mrclam, not to a scenario"),
+        ({}, "resolution", 0.1, "carmen, not to a scenario"),
+        ({}, "robots", (1, 2, 3), "mrclam, not to a scenario"),
+        ({}, "judged", (4, 5), "mrclam, not to a scenario"),
+        (WOODS, "robots", (), "mrclam, not to a woods log"),
+        (WOODS, "judged", (4,), "mrclam, not to a woods log"),
+        (WOODS, "resolution", 0.2, "carmen, not to a woods log"),
+        (MRCLAM, "resolution", 0.2, "carmen, not to a mrclam log"),
+        (MRCLAM, "runs", 512, "scenario, not to a mrclam log"),
+        (MRCLAM, "judge_runs", 7, "scenario, not to a mrclam log"),
+        (MRCLAM, "scenario", "capstone", "scenario, not to a mrclam log"),
+        (CARMEN, "motion", "arc", "scenario and woods and mrclam, not to a carmen log"),
+        (CARMEN, "gate", None, "scenario and woods and mrclam, not to a carmen log"),
+        (CARMEN, "judge_gate", 0.9, "scenario and woods and mrclam, not to a carmen log"),
+        (CARMEN, "max_gap", 1.0, "woods and mrclam, not to a carmen log"),
+    ],
+)
+def test_an_option_that_does_not_apply_is_refused(tmp_path, kind, option, value, applies):
+    expected = re.escape(f"{option}: applies to {applies}: expected it not to be given, got {value}")
+    with pytest.raises(ValueError, match=expected):
+        tuned(tmp_path, **kind, **{option: value})
+
+
+def test_what_is_not_given_has_its_default():
+    quick, plain = (tune.checked(tune.TuneConfig(quick=quick)) for quick in (True, False))
+    assert [(c.runs, c.judge_runs, c.epochs) for c in (quick, plain)] == [(32, 100, 2), (512, 2000, 20)]
+    assert (plain.scenario, plain.motion, plain.max_range) == ("capstone", "arc", None)
+    given = tune.checked(tune.TuneConfig(quick=True, runs=100, epochs=3))
+    assert (given.runs, given.epochs) == (100, 3)
+    carmen = tune.checked(tune.TuneConfig(**CARMEN))
+    assert (carmen.max_range, carmen.resolution) == (20.0, 0.1)
+    mrclam = tune.checked(tune.TuneConfig(**MRCLAM))
+    assert (mrclam.robots, mrclam.judged, mrclam.max_range, mrclam.max_gap) == ((1, 2, 3), (4, 5), None, 1.5)
+
+
+def test_a_truth_clock_that_is_off(tmp_path):
+    data = os.environ.get("JAXLOCMAP_DATA")
+    if not data:
+        pytest.skip("JAXLOCMAP_DATA does not name a folder with the real logs")
+    log = Path(data).parent / "cases" / "mrclam_clock_off"
+    with pytest.raises(ValueError, match=r"no overlap in time: truth from 1248005000.000"):
+        tuned(tmp_path, log=log, format="mrclam", robots=(1,), judged=(2,))
 
 
 @pytest.mark.parametrize(
