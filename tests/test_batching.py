@@ -184,12 +184,9 @@ def test_a_branch_on_what_all_share_stays_one_in_a_batch():
 
 # --- One call for many runs ---
 
-TRACED = []
-
 
 def weighed(values, scene, scale):
     """Of N runs: values (N, n), sorted, plus what may be shared, (N or 1, n), times what may be, too, (N or 1,)."""
-    TRACED.append((values.shape, scene["shift"].shape, scale.shape))
     return jnp.sort(values, axis=1) + scene["shift"] * scale[:, None]
 
 
@@ -221,17 +218,22 @@ def test_many_runs_at_once_are_a_plain_loop(outer, tolerance):
 
 def test_many_runs_are_one_call_and_what_they_share_stays_shared():
     values, shift, scale = map(jnp.asarray, ARGS)
+    calls = []
+
+    @batching.at_once
+    def weigh(values, scene, scale):
+        calls.append((values.shape, scene["shift"].shape, scale.shape))
+        return weighed(values, scene, scale)
 
     def batch(values, scale):
         one = jax.vmap(lambda values, scale: weigh(values, {"shift": shift[0, 0]}, scale))
         return jax.vmap(one, in_axes=(0, None))(values, scale)
 
-    TRACED.clear()
     assert compiled_from(batch, values, scale[0]).count("stablehlo.sort") == 1
-    assert ((6, 4), (1, 4), (6,)) in TRACED
+    assert ((6, 4), (1, 4), (6,)) in calls
     # The first argument is as long as there are runs even where they share it.
     jax.eval_shape(jax.vmap(lambda scale: weigh(values[0, 0], {"shift": shift[0, 0]}, scale)), scale[0])
-    assert ((3, 4), (1, 4), (3,)) in TRACED
+    assert ((3, 4), (1, 4), (3,)) in calls
 
 
 # --- Flags and constants ---
