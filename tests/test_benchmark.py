@@ -13,6 +13,7 @@ from programs import ON_CPU
 
 from jaxlocmap import ekf
 
+pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 sys.path.append(str(EXPERIMENTS))
 benchmark, course, cpp, peers = map(

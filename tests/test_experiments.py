@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from programs import ON_CPU
 
+pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 
 

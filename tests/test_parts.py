@@ -230,6 +230,7 @@ def test_every_difference_shows_in_the_manifest():
     json.dumps(made())
 
 
+@pytest.mark.slow
 def test_the_manifest_is_the_same_in_another_process():
     code = f"""if 1:
         import jax, json, sys
