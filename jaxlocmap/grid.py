@@ -45,7 +45,8 @@ def update_log_odds(
         (rows, columns) nats. Source: Elfes 1989; Thrun, Burgard & Fox 2005, section 9.2.
 
     Raises:
-        ValueError: a wrong shape, or a grid so far out that the pose's dtype cannot hold its corners to a millimetre.
+        ValueError: a wrong shape, a grid so far out that the pose's dtype cannot hold its corners to a millimetre, a
+            `max_range` of more than about a million cells, or a batch of maps that have 2**31 cells or more together.
     """
     limits: dict[str, Any] = {"spec": spec, "min_range": min_range, "max_range": max_range}
     return clamp(add_scan(log_odds, pose, ranges, beam_angles, l_occ, l_free, **limits), spec)
@@ -124,6 +125,11 @@ def _adder(spec: GridSpec, max_range: float) -> Callable[..., jax.Array]:
     def many(flats: jax.Array, lines: Lines, l_occ: jax.Array, l_free: jax.Array) -> jax.Array:
         runs, beams = len(flats), lines.free.shape[1]
         outside = runs * size
+        if outside >= 2**31:
+            raise ValueError(
+                f"log_odds: expected fewer than 2**31 cells in a batch of maps, whose index is an int32, got {runs:,} "
+                f"maps of {size:,} cells, {outside:,}"
+            )
         lines = jax.tree.map(lambda x: jnp.broadcast_to(x, (runs, *x.shape[1:])), lines)
 
         def whole(lines: Lines) -> tuple[jax.Array, jax.Array]:

@@ -9,6 +9,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 WALKS = Path(__file__).parent / "walks.py"
+# A program takes the processor even where there is a GPU, which two processes cannot share.
+ON_CPU = {**os.environ, "JAX_PLATFORMS": "cpu"}
 # What a report says of the computing and not of the study.
 COMPUTING = {"devices", "processes", "resumed_runs", "wall_s", "compile_s", "run_s", "runs_per_s"}
 

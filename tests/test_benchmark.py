@@ -9,9 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import reference
+from programs import ON_CPU
 
 from jaxlocmap import ekf
 
+pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 sys.path.append(str(EXPERIMENTS))
 benchmark, course, cpp, peers = map(
@@ -32,7 +34,7 @@ def quick(tmp_path_factory):
     """What `benchmark.py --quick` wrote and printed."""
     out = tmp_path_factory.mktemp("benchmark")
     command = [sys.executable, str(EXPERIMENTS / "benchmark.py"), "--quick", "--out", str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=ON_CPU, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return json.loads((out / "report.json").read_text()), (out / "tables.md").read_text(), done.stdout
 

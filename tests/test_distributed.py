@@ -13,6 +13,8 @@ from programs import WALKS, ended, free_port, is_free, report, result, start
 
 from jaxlocmap import hosts
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory):

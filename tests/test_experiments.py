@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import ON_CPU
 
+pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 
 
 def run(name, *arguments):
     """The program's exit status and output; a subprocess, because a program sets up JAX before it starts."""
     command = [sys.executable, str(EXPERIMENTS / f"{name}.py"), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=ON_CPU, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr
 
 

@@ -576,3 +576,22 @@ def test_a_grid_too_far_out_for_the_pose_s_precision_is_refused(origin):
     if jnp.result_type(float) == jnp.float64:
         double = scan.astype(float)
         jax.eval_shape(lambda pose: maps(pose, double, double, 0.8, -0.4), jnp.zeros(3))
+
+
+def test_a_batch_of_maps_with_more_cells_than_an_index_counts_is_refused():
+    """While tracing: nothing of that size is made."""
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.1, shape=(2**10, 2**10))
+    limits = {"spec": spec, "min_range": 0.0, "max_range": 4.0}
+
+    def one(log_odds, pose):
+        return grid.update_log_odds(log_odds, pose, jnp.ones(3), jnp.zeros(3), 1.0, -1.0, **limits)
+
+    def shape(runs):
+        given = (jax.ShapeDtypeStruct((runs, *shape), jnp.zeros(()).dtype) for shape in (spec.shape, (3,)))
+        return jax.eval_shape(jax.vmap(one), *given).shape
+
+    assert shape(2**11 - 1) == (2**11 - 1, *spec.shape)
+    with pytest.raises(
+        ValueError, match=r"^log_odds: expected fewer than 2\*\*31 cells .* got 2,048 maps of 1,048,576 "
+    ):
+        shape(2**11)

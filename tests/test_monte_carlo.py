@@ -230,6 +230,7 @@ SCRIPT = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("two", [True, False], ids=["two_devices", "all_cores"])
 def test_all_devices_together_give_what_one_gives(two):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()

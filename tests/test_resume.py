@@ -9,6 +9,7 @@ import time
 import pytest
 from programs import ROOT, WALKS, ended, report, result, start
 
+pytestmark = pytest.mark.slow
 STUDY = ("--no-map", "--runs", 8_000, "--chunk", 8)
 
 
