@@ -91,8 +91,8 @@ def main(config: BenchmarkConfig) -> dict[str, Any]:
     """Measure, write the report and the tables."""
     out = output_folder(config.out)
     check_count("pairs", config.pairs)
-    if not config.seconds > 0:
-        raise ValueError(f"seconds: expected more than 0, got {config.seconds}")
+    if not 0 < config.seconds < math.inf:
+        raise ValueError(f"seconds: expected more than 0, finite, got {config.seconds}")
     size = QUICK if config.quick else Size(config.pairs, config.seconds)
     sections = config.only or (_SECTIONS[:2] if config.quick else _SECTIONS)
     merge_kernels()

@@ -130,7 +130,7 @@ class SweepConfig:
     params: Path | None = None
     """JSON file of Q, R, l_occ, l_free, which stands at scale 1; the simulated robot's own noise by default."""
     gate: float | None = None
-    """Probability with which a good observation passes the gate, unless that is swept; None for no gate."""
+    """Probability with which a good observation passes the gate, where that is not swept; None for no gate."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/sweep")
@@ -238,11 +238,13 @@ def _grid(config: SweepConfig) -> tuple[list[float], list[float]]:
     """Values of the columns and of the rows.
 
     Raises:
-        ValueError: an unknown parameter, the same twice, or no value or an impossible one.
+        ValueError: an unknown parameter, the same twice, no value or an impossible one, or a gate both given and swept.
     """
     if config.x == config.y:
         raise ValueError(f"x, y: expected two different parameters, got {config.x} twice")
     grid = []
+    if "gate_probability" in (config.x, config.y) and config.gate is not None:
+        raise ValueError(f"gate: swept as gate_probability: expected it not to be given, got {config.gate}")
     for axis, name, values in (("x", config.x, config.x_values), ("y", config.y, config.y_values)):
         if name not in SWEPT:
             raise ValueError(f"{axis}: expected one of {', '.join(SWEPT)}, got {name!r}")

@@ -69,6 +69,8 @@ class Descent(NamedTuple):
 def main(config: CompareConfig) -> dict[str, Any]:
     """Compare, print the tables and write the report."""
     out = output_folder(config.out)
+    for name in ("runs", "judge_runs"):
+        hosts.check_count(name, getattr(config, name), least=10)  # a fifth of them is judged for some tables
     hosts.use_all_cores()
     jax.config.update("jax_disable_most_optimizations", config.quick)  # a quick run does little but compile
     runs, judge_runs = (16, 50) if config.quick else (config.runs, config.judge_runs)

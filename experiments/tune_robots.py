@@ -46,6 +46,7 @@ class RobotsConfig:
 def main(config: RobotsConfig) -> dict[str, Any]:
     """Tune on every log, judge, print the table and write the report."""
     out = output_folder(config.out)
+    hosts.check_count("splits", config.splits, most=10)
     hosts.use_all_cores()
     jax.config.update("jax_disable_most_optimizations", config.quick)  # a quick run does little but compile
     jobs = list(_jobs(config))
