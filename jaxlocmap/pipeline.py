@@ -71,8 +71,8 @@ def step(
         The next state, and what the step reports. `Info.ok` is False where a control is not finite (the robot is
         then taken to stand still, its covariance growing by Q), a step length is not finite or negative (a nominal
         step is taken, without the control), an observation is not finite, has a range that is not above zero or cannot
-        be used (it is left out), the covariance has broken down, or the pose is so far out that its dtype cannot hold
-        it to a millimetre.
+        be used (it is left out), the covariance has broken down, or the pose or an observed landmark is so far out that
+        the state's dtype cannot hold it to a millimetre.
 
     Raises:
         ValueError: shapes that do not fit, an unknown motion model, a grid in `config` but none in `state`, or a

@@ -173,7 +173,12 @@ def draw_pose(key: jax.Array, prior: Gaussian) -> jax.Array:
 
 
 def draw_drive(words: Words, k: jax.Array, dtype: Any) -> jax.Array:
-    """Random numbers for `drive` at step k, (3,). words: of this drive alone, from `normals.words_of`."""
+    """Random numbers for `drive` at step k, (3,). words: of this drive alone, from `normals.words_of`.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shape("k", k, ())
     return normals(words, k, _DRIVE, 3, dtype)
 
 
@@ -207,7 +212,12 @@ def drive(
 
 
 def draw_sighting(words: Words, k: jax.Array, j: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
-    """Random numbers for `sight` of landmark j at step k, (2,) or, with outliers, (5,)."""
+    """Random numbers for `sight` of landmark j at step k, (2,) or, with outliers, (5,).
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shapes(k=(k, ()), j=(j, ()))
     normal = normals(words, k, _SIGHTINGS + 4 * j, 2, dtype)
     if not scenario.outliers:
         return normal
@@ -236,7 +246,7 @@ def sight(
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(draws=(draws, (5 if scenario.outliers else 2,)), landmark=(landmark, (2,)))
+    checks.shapes(draws=(draws, (_sighting_draws(scenario),)), landmark=(landmark, (2,)))
     _check_noise(noise)
     x, y, heading, _ = sensor_pose(pose, scenario.sensor_offset)
     dx, dy = landmark[0] - x, landmark[1] - y
@@ -251,12 +261,21 @@ def sight(
     return jnp.stack([reach, wrap(bearing)]), near
 
 
+def _sighting_draws(scenario: Scenario) -> int:
+    return 5 if scenario.outliers else 2
+
+
 def _check_noise(noise: Noise) -> None:
     checks.shapes(**{f"noise.{name}": (value, ()) for name, value in noise._asdict().items()})
 
 
 def draw_scan(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
-    """Random numbers for `look_round` at step k, (B,)."""
+    """Random numbers for `look_round` at step k, (B,).
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shape("k", k, ())
     return normals(words, k, _SCAN, scenario.beams, dtype)
 
 
@@ -301,6 +320,7 @@ def simulate(
         ValueError: a wrong shape; a batch of drives is a `vmap`.
     """
     checks.shapes(start=(start, (3,)), landmarks=(world.landmarks, (None, 2)))
+    checks.shape("key", key, () if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else (None,))
     words, dtype, landmarks = words_of(key), start.dtype, jnp.arange(len(world.landmarks))
 
     def numbers(k: jax.Array) -> Draws:
@@ -321,6 +341,10 @@ def roll_out(draws: Draws, world: World, noise: Noise, start: jax.Array, *, scen
     """
     checks.shapes(start=(start, (3,)), landmarks=(world.landmarks, (None, 2)))
     checks.shape("draws.drive", draws.drive, (scenario.steps, 3))
+    sightings = (scenario.steps, len(world.landmarks), _sighting_draws(scenario))
+    checks.shape("draws.sighting", draws.sighting, sightings)
+    if draws.scan is not None:
+        checks.shape("draws.scan", draws.scan, (scenario.steps, scenario.beams))
 
     def body(pose: jax.Array, now: tuple[jax.Array, Draws]) -> tuple[jax.Array, tuple[Truth, Inputs]]:
         k, draws = now

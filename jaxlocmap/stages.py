@@ -59,7 +59,8 @@ def correct(
     config: Config,
 ) -> tuple[Gaussian, Sighting, jax.Array]:
     """The belief after one observation z (2,) of the landmark (2,) in a row of the list, what is reported of it (all
-    zero, row -1, if it was not used), and whether it was used. A range that is not above zero is no measurement.
+    zero, row -1, if it was not used), and whether it was used. A range that is not above zero is no measurement, and a
+    landmark so far out that its dtype cannot hold it to a millimetre is no place to measure from.
 
     Raises:
         ValueError: a wrong shape.
@@ -69,7 +70,7 @@ def correct(
     usable = usable & is_measurement(z[0], z[1])
     z = jnp.stack([jnp.where(usable, z[i], 0) for i in range(2)])  # what is no number would spoil derivatives
     residual, H, defined = sensor.linearise(belief.mean, landmark, z, config.sensor_offset)
-    used = usable & defined
+    used = usable & defined & is_held(landmark[0], landmark[1])
     threshold = ekf.gate_threshold(config.gate_probability, 2)
     softness = config.gate_softness
     update = ekf.update(*belief, residual, H, params.R, threshold=threshold, softness=softness, valid=used)
@@ -120,8 +121,13 @@ def sound(belief: Gaussian) -> jax.Array:
     """
     mean, cov = belief
     checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)))
-    far = checks.farthest(mean.dtype)
-    return is_psd(Matrix.of(cov)) & (jnp.abs(mean[0]) < far) & (jnp.abs(mean[1]) < far) & jnp.isfinite(mean[2])
+    return is_psd(Matrix.of(cov)) & is_held(mean[0], mean[1]) & jnp.isfinite(mean[2])
+
+
+def is_held(x: jax.Array, y: jax.Array) -> jax.Array:
+    """Whether a place, m, is one that its dtype can hold to a millimetre. Any shape."""
+    far = checks.farthest(x.dtype)
+    return (jnp.abs(x) < far) & (jnp.abs(y) < far)
 
 
 def map_spec(config: Config) -> GridSpec:

@@ -561,6 +561,29 @@ def test_a_pose_that_the_dtype_cannot_hold_is_flagged_where_it_cannot_be_refused
     assert info.ok.tolist() == [fine] * STEPS
 
 
+def test_an_observed_landmark_that_the_dtype_cannot_hold_is_left_out_and_flagged(single):
+    """Where it cannot be refused; one that nobody observes does no harm."""
+    config = single.config(mapping=True)
+    valid = np.asarray(single.inputs.valid)
+    names = np.asarray(single.inputs.landmark)
+    seen = {int(name) for name in names[valid]}
+    for row in range(4):
+        _, info = compiled(
+            single.params,
+            init(single.prior, config=config),
+            single.inputs,
+            landmarks=single.landmarks.at[row, row % 2].set(-16_384.0),
+            beam_angles=single.beam_angles,
+            config=config,
+        )
+        hit = valid & (names == row)
+        assert hit.any() == (row in seen)
+        np.testing.assert_array_equal(info.ok, ~hit.any(axis=1))
+        np.testing.assert_array_equal(info.row, np.where(valid & ~hit, names, -1))
+    assert seen
+    assert seen != set(range(4))
+
+
 # --- unknown landmarks
 
 

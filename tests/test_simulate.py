@@ -415,6 +415,36 @@ def test_draws_for_another_detector_or_another_drive_are_refused():
         simulate.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
 
 
+@pytest.mark.parametrize("name", ["sighting", "scan"])
+def test_draws_of_another_shape_are_refused_by_name(name):
+    shapes = {"drive": (12, 3), "sighting": (12, 4, 2), "scan": (12, 5)}
+    for wrong in ((3, *shapes[name]), (*shapes[name][:-1], 1)):
+        draws = simulate.Draws(**{key: jnp.zeros(shape) for key, shape in (shapes | {name: wrong}).items()})
+        with pytest.raises(ValueError, match=rf"^draws\.{name}: expected shape .*, got {re.escape(str(wrong))}$"):
+            simulate.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
+
+
+@pytest.mark.parametrize("steps", [(1,), (5,), (5, 2)])
+def test_random_numbers_are_those_of_one_step_and_one_landmark(steps):
+    """Of several at once, the axis of steps would come last."""
+    words, one, many = (0, 0), jnp.array(0), jnp.zeros(steps, int)
+    kind = {"scenario": SHORT, "dtype": float}
+    for name, draw in (
+        ("k", lambda: simulate.draw_drive(words, many, float)),
+        ("k", lambda: simulate.draw_sighting(words, many, one, **kind)),
+        ("j", lambda: simulate.draw_sighting(words, one, many, **kind)),
+        ("k", lambda: simulate.draw_scan(words, many, **kind)),
+    ):
+        with pytest.raises(ValueError, match=rf"^{name}: expected shape \(\), got {re.escape(str(steps))}$"):
+            draw()
+
+
+@pytest.mark.parametrize("keys", [jax.random.key, jax.random.PRNGKey])
+def test_many_keys_are_refused_by_name(keys):
+    with pytest.raises(ValueError, match=r"^key: expected shape .*, got \(5"):
+        simulate.simulate(jax.random.split(keys(0), 5), room(), Noise(), jnp.zeros(3), scenario=SHORT)
+
+
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0, math.nan, 0.0)])
 def test_a_detector_that_sits_nowhere_is_refused(offset):
     with pytest.raises(ValueError, match=r"^sensor_offset: expected finite \(dx, dy, dtheta\), got "):
