@@ -121,9 +121,10 @@ def _parameters(start: Params, end: Params, sure: tuning.Certainty) -> dict[str,
             "start": float(before[name]),
             "end": float(after[name]),
             "standard_error": float(error),
+            "interval_95": interval.tolist(),
             "unit": tuning.UNITS[name],
         }
-        for name, error in zip(sure.names, sure.standard_error, strict=True)
+        for name, error, interval in zip(sure.names, sure.standard_error, sure.interval_95, strict=True)
     }
 
 
@@ -213,10 +214,12 @@ _GROUPS = {"map": "final map against the walls", "one_scan_ahead": "map, one sca
 
 
 def _print(report: dict[str, Any]) -> None:
-    table = Table("parameter", "start", "end", "standard error", title=report["source"], title_justify="left")
+    columns = ("parameter", "start", "end", "standard error", "95 % interval")
+    table = Table(*columns, title=report["source"], title_justify="left")
     for name, value in report["parameters"].items():
-        error = value["standard_error"]
-        table.add_row(f"{name}, {value['unit']}", f"{value['start']:.4g}", f"{value['end']:.4g}", f"{error:.2g}")
+        low, high = value["interval_95"]
+        numbers = (f"{value['start']:.4g}", f"{value['end']:.4g}", f"{value['standard_error']:.2g}")
+        table.add_row(f"{name}, {value['unit']}", *numbers, f"[{low:.4g}, {high:.4g}]")
     CONSOLE.print(table)
     table = Table("held out", "quantity", "before", "after")
     before, after = report["held_out"]["before"], report["held_out"]["after"]

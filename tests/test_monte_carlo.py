@@ -1,6 +1,7 @@
 """The map over runs against a plain Python loop, whatever the chunk, the devices and the number of runs."""
 
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -127,7 +128,9 @@ def test_progress_counts_the_runs_done():
 @pytest.mark.parametrize("name", ["runs", "chunk"])
 def test_anything_but_a_whole_number_from_one_on_is_refused(name, wrong):
     numbers = {"runs": 5, "chunk": 5} | {name: wrong}
-    with pytest.raises(ValueError, match=f"^{name}: expected at least 1, a whole number, got {wrong}$"):
+    with pytest.raises(
+        ValueError, match=f"^{name}: expected at least 1, a whole number, got {re.escape(repr(wrong))}$"
+    ):
         monte_carlo(one_run, KEY, numbers["runs"], *ARGS, chunk=numbers["chunk"])
 
 

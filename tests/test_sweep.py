@@ -295,6 +295,7 @@ def test_a_picture_is_made_of_any_cells(tmp_path, shape, anees):
         ({"x": "gate_probability", "x_values": (0.0,)}, r"x_values: expected a probability in \(0, 1\] .*, got 0"),
         ({"x": "gate_probability", "x_values": (1.1,)}, r"x_values: expected a probability in \(0, 1\] .*, got 1.1"),
         ({"x": "outlier_rate", "x_values": (-0.1,)}, r"x_values: expected a share in \[0, 1\] .*, got -0.1"),
+        ({"x": "gate_probability", "gate": 0.9}, "gate: swept as gate_probability: expected it not to be given"),
         ({"runs": 1}, "runs: expected at least 2, which a band needs, got 1"),
         ({"scenario": "moon"}, "scenario: expected one of"),
     ],

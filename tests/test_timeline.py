@@ -66,6 +66,7 @@ def test_up_to_the_limit_a_command_holds(max_gap):
         (2.0, None, [4, 9, 9.25, 9.5], [0, 1.3, 1.3], 5),
         (None, 1.4, [0, 0.5, 1, 1.25], [1, 1.1, 1.2], 0),
         (9.0, None, [9, 9.25, 9.5], [1.3, 1.3], 0),
+        (4.0, 4.0, [4], [], 0),
     ],
 )
 def test_only_the_gaps_between_start_and_stop_count(start, stop, time, speeds, seconds):

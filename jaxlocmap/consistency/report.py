@@ -153,7 +153,7 @@ def verdict(means: PoseMeans, basis: Basis) -> str:
     if off <= _TOLERANCE and not lost:
         return f"consistent within {100 * _TOLERANCE:g} %: {stated}, {band}"
     cause = _cause(basis, relative.value)
-    if cause and 1 / _LITTLE < relative.value < _LITTLE:
+    if cause and 1 / _LITTLE < relative.value < _LITTLE and _disturbed(basis, axes):
         return _joined(f"undecided: {stated} lies outside {band}, which {cause} can bring about by itself", lost)
 
     side = "over-confident" if relative.value > 1 else "under-confident"
