@@ -52,8 +52,8 @@ class Totals(NamedTuple):
     variance: tuple[jax.Array, ...]  # the same of the filter's own
     average: Averages
     average_square: Averages  # of each run's average, squared
-    phase_runs: jax.Array  # (PHASES,) runs with any step of the phase scored
-    phase_nees: jax.Array  # (2, PHASES) the run's average NEES in each phase, and its square
+    whole_runs: jax.Array  # () runs with every step scored
+    phase_nees: jax.Array  # (2, PHASES) of these, the run's average NEES in each phase, and its square
     kept_runs: jax.Array  # () scored runs that have not diverged
     kept_nees: jax.Array  # (2,) their average NEES, and its square
     nees_bins: jax.Array  # (len(NEES_EDGES) + 1,) scored runs by their average NEES
@@ -80,7 +80,6 @@ class StepTally(NamedTuple):
     axis_nees: jax.Array  # (3,)
     within_two_sigma: jax.Array  # (3,)
     covered: jax.Array  # (levels,)
-    phase_scored: jax.Array  # (PHASES,)
     phase_nees: jax.Array  # (PHASES,)
     flagged: jax.Array  # ()
     lost: jax.Array  # ()
@@ -118,11 +117,15 @@ class PerStep(NamedTuple):
     accepted: jax.Array
 
 
+def phase_edges(steps: int) -> list[int]:
+    """The first step of each phase of a drive, and the step after the last: step k is in phase PHASES k // steps."""
+    return [-(-i * steps // PHASES) for i in range(PHASES + 1)]
+
+
 def no_steps(zero: jax.Array) -> StepTally:
     """The tally before the first step. zero: () of the dtype to count in."""
     three, levels = jnp.full(3, zero), jnp.full(len(consistency.COVERAGE_LEVELS), zero)
-    phases = jnp.full(PHASES, zero)
-    return StepTally(zero, zero, three, three, levels, phases, phases, zero, zero)
+    return StepTally(zero, zero, three, three, levels, jnp.full(PHASES, zero), zero, zero)
 
 
 def no_sightings(zero: jax.Array) -> SightingTally:
@@ -151,8 +154,7 @@ def score_step(
         axis_nees=jnp.stack(score.axis_nees),
         within_two_sigma=jnp.stack([(scored & (ratio <= 4)).astype(dtype) for ratio in score.axis_nees]),
         covered=jnp.stack([(scored & (nees < quantile)).astype(dtype) for quantile in quantiles]),
-        phase_scored=jnp.stack([jnp.where(phase == i, scored, False).astype(dtype) for i in range(PHASES)]),
-        phase_nees=jnp.stack([jnp.where(phase == i, nees, 0) for i in range(PHASES)]),
+        phase_nees=jnp.stack([nees * (phase == i).astype(dtype) for i in range(PHASES)]),
         flagged=(~ok).astype(dtype),
         lost=score.lost.astype(dtype),
     )
@@ -189,13 +191,16 @@ def run_totals(
     belief: Gaussian,
     of_map: MapTotals | None,
     *,
+    length: int,
     exact_start: bool,
 ) -> dict[str, Any]:
-    """What one run adds to a study: the fields of `Totals` that are not `PerStep`, by name."""
+    """What one run of `length` steps adds to a study: the fields of `Totals` that are not `PerStep`, by name."""
     dtype = steps.nees.dtype
     some, seen = jnp.maximum(steps.scored, 1), jnp.maximum(sightings.observed, 1)
     average = Averages(*(x / some for x in (steps.nees, steps.axis_nees, steps.within_two_sigma, steps.covered)))
-    phase_nees = steps.phase_nees / jnp.maximum(steps.phase_scored, 1)
+    whole = (steps.scored == length).astype(dtype)
+    spans = np.diff(phase_edges(length))
+    phase_nees = whole * steps.phase_nees / jnp.asarray(np.maximum(spans, 1), dtype)
     run_nis = sightings.nis / seen
     ended = jnp.all(jnp.isfinite(truth - belief.mean)) & jnp.all(jnp.isfinite(jnp.diagonal(belief.cov)))
     diverged = (steps.lost > 0) | ~ended
@@ -211,7 +216,7 @@ def run_totals(
         scored_runs=scored.astype(dtype),
         average=average,
         average_square=jax.tree.map(jnp.square, average),
-        phase_runs=(steps.phase_scored > 0).astype(dtype),
+        whole_runs=whole,
         phase_nees=jnp.stack([phase_nees, phase_nees**2]),
         kept_runs=kept,
         kept_nees=kept * jnp.stack([average.nees, average.nees**2]),

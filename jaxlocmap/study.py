@@ -32,6 +32,7 @@ from jaxlocmap.scoring import (
     map_totals,
     no_sightings,
     no_steps,
+    phase_edges,
     run_totals,
     score_sighting,
     score_step,
@@ -144,7 +145,9 @@ class Study:
         if log_odds is not None and config.grid is not None:
             log_odds = grid.clamp(log_odds, config.grid)
         of_map = map_totals(log_odds, world, config)
-        of_run = run_totals(steps, sightings, pose, belief, of_map, exact_start=scenario.exact_prior)
+        of_run = run_totals(
+            steps, sightings, pose, belief, of_map, length=scenario.steps, exact_start=scenario.exact_prior
+        )
         return Totals(**per_step._asdict(), **add_up(of_run))
 
     def summed(self, key: jax.Array, counted: jax.Array, *args: Any, **kwargs: Any) -> Totals:
@@ -183,7 +186,7 @@ def pose_means(totals: Any, config: Config) -> consistency.PoseMeans:
 
     three, levels = range(3), consistency.COVERAGE_LEVELS
     steps = len(totals.nees)
-    edges = [-(-i * steps // PHASES) for i in range(PHASES + 1)]
+    edges = phase_edges(steps)
     return consistency.PoseMeans(
         nees=_mean_over_runs(sums.nees, squares.nees, runs, consistency.POSE_DIMENSION),
         kept_nees=_mean_over_runs(
@@ -196,7 +199,7 @@ def pose_means(totals: Any, config: Config) -> consistency.PoseMeans:
         covered=tuple(shares(sums.covered[i], squares.covered[i], level) for i, level in enumerate(levels)),
         phases=tuple(
             _mean_over_runs(
-                totals.phase_nees[0, i], totals.phase_nees[1, i], totals.phase_runs[i], consistency.POSE_DIMENSION
+                totals.phase_nees[0, i], totals.phase_nees[1, i], totals.whole_runs, consistency.POSE_DIMENSION
             )
             for i in range(PHASES)
         ),

@@ -317,7 +317,8 @@ def score(truth, valid, gate, ok, of_map, exact_start=True, *, mean, cov, innova
         / count,
     )
     parts = [slice(-(-i * len(nees) // PHASES), -(-(i + 1) * len(nees) // PHASES)) for i in range(PHASES)]
-    phase_nees = np.array([nees[part].sum() / max(scored[part].sum(), 1) for part in parts])
+    whole = scored.all()
+    phase_nees = whole * np.array([nees[part].mean() for part in parts])
     run_nis, kept = nis.sum() / max(observed.sum(), 1), scored.any() and ended and not lost
     bins = np.zeros(len(NEES_EDGES) + 1)
     bins[np.searchsorted(NEES_EDGES, average.nees, side="right")] += scored.any()
@@ -331,7 +332,7 @@ def score(truth, valid, gate, ok, of_map, exact_start=True, *, mean, cov, innova
         variance=tuple(variance.T),
         average=average,
         average_square=jax.tree.map(np.square, average),
-        phase_runs=np.array([scored[part].any() for part in parts]),
+        whole_runs=whole,
         phase_nees=np.stack([phase_nees, phase_nees**2]),
         kept_runs=kept,
         kept_nees=kept * np.array([average.nees, average.nees**2]),
@@ -709,7 +710,7 @@ def hand_made():
         average_square=Averages(  # averages 2 and 4; 0.2 and 0.8, 0.5 and 1.5, 1 and 2; ...
             np.array(20.0), np.array([0.68, 2.5, 5.0]), np.array([2.0, 1.25, 0.5]), np.array([0.25, 0.5, 1.25, 2.0])
         ),
-        phase_runs=np.array([2.0, 0.0, 2.0, 0.0]),
+        whole_runs=np.array(2.0),
         phase_nees=np.array([[8.0, 0.0, 4.0, 0.0], [34.0, 0.0, 10.0, 0.0]]),
         kept_runs=np.array(1.0),
         kept_nees=np.array([2.0, 4.0]),
@@ -784,7 +785,7 @@ def test_a_report_of_totals_made_by_hand():
     assert list(report["innovation_lag_one_band_95"].values()) == pytest.approx(12.7062 * spread, abs=1e-4)
     # Standard errors of two runs are half their distance: x 0.2 and 0.8.
     assert report["axis_nees_interval_95"]["x"] == pytest.approx((0.5 - 12.706 * 0.3, 0.5 + 12.706 * 0.3), abs=1e-3)
-    assert [phase["anees"] for phase in report["nees_phases"]][::2] == [4.0, 2.0]
+    assert [phase["anees"] for phase in report["nees_phases"]] == [4.0, 0.0, 2.0, 0.0]
     assert 2.0 <= report["anees_median_run"] <= 2.0 * math.exp(0.05)  # the lower one of two
     assert "; 1 of 2 runs diverged" in report["verdict"]
     assert report["map"] == {
