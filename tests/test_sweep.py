@@ -147,7 +147,7 @@ def test_what_outliers_and_a_gate_do(grid):
     let_in, seen = grid.accepted.sum(-1), grid.observed.sum(-1)
     np.testing.assert_array_equal(let_in[1], seen[1])  # a gate of 1 is none
     assert np.all(let_in[0, 1:] < 0.9 * seen[0, 1:])
-    assert np.all(grid.run_nees[1, 1:, 0] > 100 * grid.run_nees[1, 0, 0])  # without one, the robot is lost
+    assert np.all(grid.average.nees[1, 1:] > 100 * grid.average.nees[1, 0])  # without one, the robot is lost
 
 
 def test_other_values_compile_nothing(program):

@@ -38,7 +38,7 @@ def test_simulated_drives(tmp_path):
     report = tuned(tmp_path, motion="euler", tune=("range", "bearing"), optimiser="adam", gate=None)
     assert set(report["parameters"]) == {"range", "bearing"}
     for value in report["parameters"].values():
-        assert {"start", "end", "standard_error", "unit"} == set(value)
+        assert {"start", "end", "standard_error", "interval_95", "unit"} == set(value)
     losses = report["loss"]["innovation"]
     assert losses["train_after"] < losses["train_before"] - 0.3
     assert losses["validation_after"] < losses["validation_before"] - 0.3
