@@ -85,10 +85,10 @@ def judge(
     }
     nees = np.where(scored, score.nees, np.nan)
     axis = np.where(scored[..., None], np.stack(score.axis_nees, -1), np.nan)
-    judged = scored.any(1)
-    diverged: np.ndarray = np.any(np.asarray(score.lost) & scored, axis=1)
+    known = valid & np.isfinite(truth).all(-1)
+    diverged = _diverged(known, scored, np.asarray(score.lost))
     means, spans = _means(nees, axis, diverged, stamps)
-    runs_judged = int(judged.sum())
+    runs_judged = int(known.any(1).sum())
     basis = Basis(
         runs=runs_judged,
         steps=int(scored.sum()),
@@ -166,6 +166,13 @@ def _score(truth: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> PoseScore:
 @jax.jit
 def _score_all(truth: jax.Array, mean: jax.Array, cov: jax.Array) -> PoseScore:
     return jax.vmap(jax.vmap(score_pose))(truth, mean, cov)
+
+
+def _diverged(known: np.ndarray, scored: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    """Runs (N,) that lost the robot at any step, or whose belief at their last step with truth is none."""
+    last = known.shape[1] - 1 - np.argmax(known[:, ::-1], axis=1)
+    ended = scored[np.arange(len(known)), last]
+    return np.any(lost & scored, axis=1) | (known.any(1) & ~ended)
 
 
 def _over_runs(values: np.ndarray) -> np.ndarray:

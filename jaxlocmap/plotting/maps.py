@@ -53,7 +53,8 @@ def trajectory_figure(
                 (estimate[k, 0], estimate[k, 1]), width, height, angle=angle, fill=False, color="tab:red", label=label
             )
         )
-    ax.set(xlabel="x [m]", ylabel="y [m]", title=title, aspect="equal")
+    ax.set(xlabel="x [m]", ylabel="y [m]", title=title)
+    ax.set_aspect("equal", adjustable="datalim")  # a straight drive would leave no height
     figure.legend(fontsize=8, loc="outside lower center", ncols=5)
     figure.savefig(path, dpi=120)
 

@@ -88,7 +88,8 @@ def judge_figure(path: Path, report: dict[str, Any], where: np.ndarray, title: s
     span = max(float(np.nanmax(np.abs(np.log10(ratio)), initial=0.5)), 0.5)
     dots = ax.scatter(*where.T, c=ratio, s=4, cmap="RdBu_r", norm=LogNorm(10**-span, 10**span))
     figure.colorbar(dots, ax=ax, label="NEES over 3 [–]: red is over-confident")
-    ax.set(title="Where", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    ax.set(title="Where", xlabel="x [m]", ylabel="y [m]")
+    ax.set_aspect("equal", adjustable="datalim")  # a straight drive would leave no height
     _title(figure, title, report["verdict"])
     figure.savefig(path, dpi=120)
 
