@@ -241,7 +241,7 @@ def test_params_made_of_lists_are_refused_by_name():
 # --- precision
 
 
-@pytest.mark.parametrize("kind", [jnp.float32, jnp.float64, jnp.float16])
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.float16])
 def test_the_farthest_coordinate_is_where_numbers_begin_to_lie_a_millimetre_apart(kind):
     far = checks.farthest(kind)
     assert np.spacing(np.nextafter(kind(far), kind(0))) <= 1e-3 < np.spacing(kind(far))

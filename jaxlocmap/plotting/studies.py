@@ -62,8 +62,9 @@ def judge_figure(path: Path, report: dict[str, Any], where: np.ndarray, title: s
     Args:
         where: (T, 2) m, the true positions of one run at the report's steps; NaN where unknown.
     """
-    figure = Figure(figsize=(14, 9), layout="constrained")
+    figure = Figure(figsize=(14, 9))  # placed by hand: axes of equal scale can leave an automatic layout no room
     axes = figure.subplots(2, 2, width_ratios=(1.6, 1))
+    figure.subplots_adjust(left=0.06, right=0.97, bottom=0.07, top=0.89, hspace=0.3, wspace=0.18)
     time, nees = np.array(report["time"]), np.array(report["nees_per_step"], float)
     runs = report["runs"]
     low, high = report["nees_band_95"]
