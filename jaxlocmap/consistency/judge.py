@@ -73,7 +73,8 @@ def judge(
     if not np.all(np.diff(stamps) > 0):
         raise ValueError(f"time: expected increasing stamps, got {np.sum(~(np.diff(stamps) > 0))} that do not")
 
-    finite = valid & np.isfinite(truth).all(-1) & np.isfinite(mean).all(-1) & np.isfinite(cov).all((-1, -2))
+    known = valid & np.isfinite(truth).all(-1)
+    finite = known & np.isfinite(mean).all(-1) & np.isfinite(cov).all((-1, -2))
     symmetric = _is_symmetric(cov)
     score = _score(truth, mean, cov)
     scored = finite & symmetric & score.scored
@@ -85,7 +86,6 @@ def judge(
     }
     nees = np.where(scored, score.nees, np.nan)
     axis = np.where(scored[..., None], np.stack(score.axis_nees, -1), np.nan)
-    known = valid & np.isfinite(truth).all(-1)
     diverged = _diverged(known, scored, np.asarray(score.lost))
     means, spans = _means(nees, axis, diverged, stamps)
     runs_judged = int(known.any(1).sum())
