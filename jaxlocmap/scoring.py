@@ -35,9 +35,16 @@ class Averages(NamedTuple):
     """Of one run, over its scored steps."""
 
     nees: jax.Array  # ()
-    axis_nees: jax.Array  # (3,) of each axis alone, error² / σ²
     within_two_sigma: jax.Array  # (3,) share of steps
     covered: jax.Array  # (levels,) share of steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
+
+
+class Undiverged(NamedTuple):
+    """Of one run that has not diverged: averages that a single diverged one would outweigh. Else zero."""
+
+    nees: jax.Array  # () over its scored steps
+    axis_nees: jax.Array  # (3,) the same of each axis alone, error² / σ²
+    phase_nees: jax.Array  # (PHASES,) over each phase, if every step is scored
 
 
 class Totals(NamedTuple):
@@ -52,10 +59,10 @@ class Totals(NamedTuple):
     variance: tuple[jax.Array, ...]  # the same of the filter's own
     average: Averages
     average_square: Averages  # of each run's average, squared
-    whole_runs: jax.Array  # () runs with every step scored
-    phase_nees: jax.Array  # (2, PHASES) of these, the run's average NEES in each phase, and its square
-    kept_runs: jax.Array  # () scored runs that have not diverged
-    kept_nees: jax.Array  # (2,) their average NEES, and its square
+    undiverged_runs: jax.Array  # () scored runs that have not diverged
+    whole_runs: jax.Array  # () of these, with every step scored
+    undiverged: Undiverged
+    undiverged_square: Undiverged  # of each run's average, squared
     nees_bins: jax.Array  # (len(NEES_EDGES) + 1,) scored runs by their average NEES
     run_nis: jax.Array  # (2,) the run's average NIS, and its square
     observing_runs: jax.Array  # () runs with any observation scored
@@ -63,9 +70,8 @@ class Totals(NamedTuple):
     unscored_observations: jax.Array  # () the others: a reading or a belief that is no number
     nis: jax.Array  # (T,)
     accepted: jax.Array  # (T,)
-    lag_products: jax.Array  # (2,) range, bearing
-    lag_squares: jax.Array  # (2,)
-    lag_spread: jax.Array  # (3, 2) of the run's own products and squares: products², products * squares, squares²
+    lag_one: jax.Array  # (2, 2) the run's correlations at lag one of range and bearing, and their squares
+    lag_runs: jax.Array  # () runs with any pair of observations of one landmark
     lag_pairs: jax.Array  # ()
     flagged_steps: jax.Array  # () steps whose `Info.ok` is False
     diverged: jax.Array  # () 1 if the run lost the robot at any step, or ended without a finite belief
@@ -94,7 +100,7 @@ class SightingTally(NamedTuple):
     unscored: jax.Array  # ()
     unusable: jax.Array  # ()
     lag_products: jax.Array  # (2,)
-    lag_squares: jax.Array  # (2,)
+    lag_squares: jax.Array  # (2,) mean of both members' squares
     lag_pairs: jax.Array  # ()
 
 
@@ -168,7 +174,7 @@ def score_sighting(
     dtype = sighting.nis.dtype
     white = consistency.whiten(sighting.innovation, sighting.S)
     # What the filter could not use has S zero; where the belief has broken down, nothing whitens to a number.
-    measured = (sighting.S[0, 0] > 0) & jnp.isfinite(white[0] + white[1])
+    measured = (sighting.S[0, 0] > 0) & jnp.isfinite(white[0] ** 2 + white[1] ** 2)
     paired = measured & latest.seen
     tally = SightingTally(
         observed=measured.astype(dtype),
@@ -177,7 +183,7 @@ def score_sighting(
         unscored=(valid & ~measured).astype(dtype),
         unusable=(valid & ~used).astype(dtype),
         lag_products=jnp.stack([jnp.where(paired, white[i] * latest.white[i], 0) for i in range(2)]),
-        lag_squares=jnp.stack([jnp.where(paired, white[i] ** 2, 0) for i in range(2)]),
+        lag_squares=jnp.stack([jnp.where(paired, (white[i] ** 2 + latest.white[i] ** 2) / 2, 0) for i in range(2)]),
         lag_pairs=paired.astype(dtype),
     )
     first, second = (jnp.where(measured, white[i], latest.white[i]) for i in range(2))
@@ -197,36 +203,40 @@ def run_totals(
     """What one run of `length` steps adds to a study: the fields of `Totals` that are not `PerStep`, by name."""
     dtype = steps.nees.dtype
     some, seen = jnp.maximum(steps.scored, 1), jnp.maximum(sightings.observed, 1)
-    average = Averages(*(x / some for x in (steps.nees, steps.axis_nees, steps.within_two_sigma, steps.covered)))
-    whole = (steps.scored == length).astype(dtype)
-    spans = np.diff(phase_edges(length))
-    phase_nees = whole * steps.phase_nees / jnp.asarray(np.maximum(spans, 1), dtype)
+    average = Averages(*(x / some for x in (steps.nees, steps.within_two_sigma, steps.covered)))
     run_nis = sightings.nis / seen
     ended = jnp.all(jnp.isfinite(truth - belief.mean)) & jnp.all(jnp.isfinite(jnp.diagonal(belief.cov)))
     diverged = (steps.lost > 0) | ~ended
     scored = steps.scored > 0
-    kept = (scored & ~diverged).astype(dtype)
+    kept = scored & ~diverged
+    whole = kept & (steps.scored == length)
+    spans = jnp.asarray(np.maximum(np.diff(phase_edges(length)), 1), dtype)
+    undiverged = Undiverged(
+        nees=jnp.where(kept, average.nees, 0),
+        axis_nees=jnp.where(kept, steps.axis_nees / some, 0),
+        phase_nees=jnp.where(whole, steps.phase_nees / spans, 0),
+    )
     # Each run is counted at its lowest edge that lies above; differences make bins of these.
     below = jnp.concatenate([average.nees < jnp.asarray(NEES_EDGES, dtype), jnp.full(1, scored)]) & scored
     bins = below.astype(dtype) - jnp.concatenate([jnp.zeros(1, dtype), below[:-1].astype(dtype)])
-    products, squares = sightings.lag_products, sightings.lag_squares
+    paired, squares = sightings.lag_pairs > 0, sightings.lag_squares
+    lag_one = jnp.where(paired, sightings.lag_products / jnp.where(paired, squares, 1), 0)
     return dict(
         runs=jnp.ones((), dtype),
         exact_starts=jnp.full((), exact_start, dtype),
         scored_runs=scored.astype(dtype),
         average=average,
         average_square=jax.tree.map(jnp.square, average),
-        whole_runs=whole,
-        phase_nees=jnp.stack([phase_nees, phase_nees**2]),
-        kept_runs=kept,
-        kept_nees=kept * jnp.stack([average.nees, average.nees**2]),
+        undiverged_runs=kept.astype(dtype),
+        whole_runs=whole.astype(dtype),
+        undiverged=undiverged,
+        undiverged_square=jax.tree.map(jnp.square, undiverged),
         nees_bins=bins,
         run_nis=jnp.stack([run_nis, run_nis**2]),
         observing_runs=(sightings.observed > 0).astype(dtype),
         unscored_observations=sightings.unscored,
-        lag_products=products,
-        lag_squares=squares,
-        lag_spread=jnp.stack([products**2, products * squares, squares**2]),
+        lag_one=jnp.stack([lag_one, lag_one**2]),
+        lag_runs=paired.astype(dtype),
         lag_pairs=sightings.lag_pairs,
         flagged_steps=steps.flagged,
         diverged=diverged.astype(dtype),

@@ -180,6 +180,7 @@ def _mean_over_runs(
 def pose_means(totals: Any, config: Config) -> consistency.PoseMeans:
     """The means over runs of the pose's statistics; arguments as of `summarise`."""
     runs, sums, squares = totals.scored_runs, totals.average, totals.average_square
+    kept, kept_squares = totals.undiverged, totals.undiverged_square
 
     def shares(total: np.ndarray, square: np.ndarray, expected: float) -> consistency.Mean:
         return _mean_over_runs(total, square, runs, expected, expected * (1 - expected))
@@ -189,17 +190,19 @@ def pose_means(totals: Any, config: Config) -> consistency.PoseMeans:
     edges = phase_edges(steps)
     return consistency.PoseMeans(
         nees=_mean_over_runs(sums.nees, squares.nees, runs, consistency.POSE_DIMENSION),
-        kept_nees=_mean_over_runs(
-            totals.kept_nees[0], totals.kept_nees[1], totals.kept_runs, consistency.POSE_DIMENSION
+        undiverged_nees=_mean_over_runs(
+            kept.nees, kept_squares.nees, totals.undiverged_runs, consistency.POSE_DIMENSION
         ),
-        axis_nees=tuple(_mean_over_runs(sums.axis_nees[i], squares.axis_nees[i], runs, 1) for i in three),
+        axis_nees=tuple(
+            _mean_over_runs(kept.axis_nees[i], kept_squares.axis_nees[i], totals.undiverged_runs, 1) for i in three
+        ),
         within_two_sigma=tuple(
             shares(sums.within_two_sigma[i], squares.within_two_sigma[i], consistency.WITHIN_TWO_SIGMA) for i in three
         ),
         covered=tuple(shares(sums.covered[i], squares.covered[i], level) for i, level in enumerate(levels)),
         phases=tuple(
             _mean_over_runs(
-                totals.phase_nees[0, i], totals.phase_nees[1, i], totals.whole_runs, consistency.POSE_DIMENSION
+                kept.phase_nees[i], kept_squares.phase_nees[i], totals.whole_runs, consistency.POSE_DIMENSION
             )
             for i in range(PHASES)
         ),
@@ -234,7 +237,8 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
         The statistics by name, ready for JSON. The lag-one value of "bearing" is that of the bearing given the range,
         since innovations are whitened in that order; zero is expected of it without a gate. `anees_band_95` comes from
         the spread between runs around 3; `nees_band_95` is the χ² band of one step's mean over runs, and
-        `nees_steps_in_band` the share of steps in it.
+        `nees_steps_in_band` the share of steps in it. `axis_nees` and `nees_phases` are those of undiverged
+        runs: a single lost one would outweigh all others.
     """
     runs = round(float(totals.runs))
     steps = len(totals.nees)
@@ -248,10 +252,9 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
     error_square, variance = np.stack(totals.error_square, -1), np.stack(totals.variance, -1)
     rms = np.sqrt(error_square.sum(0) / max(all_scored, 1))
     rate = float(totals.accepted.sum()) / observations if observations else math.nan
-    lag, lag_error = consistency.lag_correlation(
-        totals.lag_products, totals.lag_squares, totals.lag_spread, runs, float(totals.lag_pairs)
+    lag, lag_reach = consistency.mean_lag_one(
+        totals.lag_one[0], totals.lag_one[1], round(float(totals.lag_runs)), float(totals.lag_pairs)
     )
-    lag_reach = (consistency.student_t(runs) if runs > 1 else 1.96) * lag_error
     diverged = round(float(totals.diverged))
     observing = totals.observed > 0
     basis = consistency.Basis(
@@ -261,13 +264,16 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
         exact_start=bool(totals.exact_starts > 0),
         gate=config.gate_probability is not None,
         reference=None if reference is None else pose_means(reference, config),
+        reference_diverged=(0, 0)
+        if reference is None
+        else (round(float(reference.diverged)), round(float(reference.runs))),
     )
     report = {
         "runs": runs,
         "steps": steps,
         **consistency.pose_fields(means),
-        "anees_undiverged": means.kept_nees.value,
-        "anees_undiverged_interval_95": means.kept_nees.interval_95,
+        "anees_undiverged": means.undiverged_nees.value,
+        "anees_undiverged_interval_95": means.undiverged_nees.interval_95,
         "anees_median_run": median_nees(totals.nees_bins),
         "anees_reference": None if basis.reference is None else basis.reference.nees.value,
         "exact_start": basis.exact_start,

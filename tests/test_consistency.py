@@ -17,7 +17,6 @@ REACH = scipy.stats.norm.isf(FAILURE / 2)
 
 nees = jax.jit(jax.vmap(consistency.nees))
 whiten = jax.jit(jax.vmap(consistency.whiten))
-lag_one = jax.jit(consistency.lag_one)
 
 
 def covariances(count, size, seed=0):
@@ -105,32 +104,7 @@ def test_an_empty_slot_whitens_to_zero():
     np.testing.assert_array_equal(whiten(jnp.zeros((1, 2)), jnp.zeros((1, 2, 2))), 0)
 
 
-# --- Whiteness ---
-
-
-def plain_lag_one(white, observed):
-    """Pairs of an observation and the one before it of the same landmark, in plain loops."""
-    products, squares, pairs = np.zeros(white.shape[-1]), np.zeros(white.shape[-1]), 0
-    for j in range(observed.shape[1]):
-        previous = None
-        for k in range(len(observed)):
-            if observed[k, j]:
-                if previous is not None:
-                    products += white[k, j] * previous
-                    squares += white[k, j] ** 2
-                    pairs += 1
-                previous = white[k, j]
-    return products, squares, pairs
-
-
-@pytest.mark.parametrize("share", [0.0, 0.05, 0.5, 1.0])
-def test_lag_one_pairs_each_observation_with_the_last_of_its_landmark_across_gaps(share, tolerance):
-    rng = np.random.default_rng(4)
-    white, observed = rng.normal(size=(40, 3, 2)), rng.random((40, 3)) < share
-    # Values of empty slots must not matter.
-    got = lag_one(jnp.array(white), jnp.array(observed))
-    for value, expected in zip(got, plain_lag_one(white, observed), strict=True):
-        np.testing.assert_allclose(value, expected, rtol=tolerance(1e-12, 1e-4), atol=tolerance(1e-12, 1e-4))
+# --- Quantiles and bands ---
 
 
 def correlated_noise(rng, shape, rho):
@@ -139,24 +113,6 @@ def correlated_noise(rng, shape, rho):
     for k in range(1, len(noise)):
         noise[k] = rho * noise[k - 1] + math.sqrt(1 - rho**2) * noise[k]
     return noise
-
-
-@pytest.mark.parametrize("rho", [0.0, 0.05, 0.6, -0.3])
-def test_lag_one_is_the_autocorrelation_and_its_band_holds_white_noise_alone(rho):
-    rng = np.random.default_rng(5)
-    # Every landmark is seen at times of its own: the process runs over its sightings.
-    observed = rng.random((6000, 4)) < 0.5
-    white = np.zeros((6000, 4, 2))
-    for j in range(4):
-        white[observed[:, j], j] = correlated_noise(rng, (observed[:, j].sum(), 2), rho)
-    products, squares, pairs = lag_one(jnp.array(white), jnp.array(observed))
-    found, band = np.asarray(products / squares), 1.96 / math.sqrt(pairs)
-    # The estimate's standard error is sqrt((1 - rho²) / pairs).
-    assert np.all(np.abs(found - rho) < REACH * math.sqrt((1 - rho**2) / pairs))
-    assert np.all(np.abs(found) < band) == (rho == 0)
-
-
-# --- Quantiles and bands ---
 
 
 @pytest.mark.parametrize("degrees", [1, 2, 3, 150, 7_200_000])

@@ -116,11 +116,11 @@ def test_lag_one_pairs_each_observation_with_the_last_of_its_landmark_and_its_ba
         np.linalg.solve(np.linalg.cholesky(S), nu) for nu, S in zip(made.nu[seen], made.S[seen], strict=True)
     ]
     series = white[:, ::3]
-    products, squares = (series[:, 1:] * series[:, :-1]).sum((1, 2)), (series[:, 1:] ** 2).sum((1, 2))
-    expected = products.sum(0) / squares.sum(0)
+    before, after = series[:, :-1], series[:, 1:]
+    each = 2 * (before * after).sum((1, 2)) / (before**2 + after**2).sum((1, 2))
+    expected = each.mean(0)
     assert list(report["innovation_lag_one"].values()) == pytest.approx(expected.tolist(), rel=1e-9)
-    spread = np.sqrt(((products - expected * squares) ** 2).sum(0) * RUNS / (RUNS - 1)) / squares.sum(0)
-    band = scipy.stats.t.ppf(0.975, RUNS - 1) * spread
+    band = scipy.stats.t.ppf(0.975, RUNS - 1) * each.std(0, ddof=1) / math.sqrt(RUNS)
     assert list(report["innovation_lag_one_band_95"].values()) == pytest.approx(band.tolist(), rel=1e-6)
     assert np.all(np.abs(expected) < 2 * band)
     # The same with the slots in another order and their landmarks named.
@@ -132,6 +132,40 @@ def test_lag_one_pairs_each_observation_with_the_last_of_its_landmark_and_its_ba
     )
     again = judge(made.truth, made.mean, made.cov, innovations=mixed)
     assert again["innovation_lag_one"] == pytest.approx(report["innovation_lag_one"], rel=1e-9)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.05, 0.6, -0.3])
+def test_lag_one_of_one_run_is_the_autocorrelation_and_its_band_holds_white_noise_alone(rho):
+    rng = np.random.default_rng(5)
+    steps, slots = 6000, 4
+    # Every landmark is seen at times of its own: the process runs over its sightings.
+    seen = rng.random((steps, slots)) < 0.5
+    white = np.full((steps, slots, 2), np.nan)
+    for j in range(slots):
+        noise = rng.normal(size=(seen[:, j].sum(), 2))
+        for k in range(1, len(noise)):
+            noise[k] = rho * noise[k - 1] + math.sqrt(1 - rho**2) * noise[k]
+        white[seen[:, j], j] = noise
+    S = np.array([[0.04, 0.003], [0.003, 0.01]])
+    given = Innovations(white @ np.linalg.cholesky(S).T, np.broadcast_to(S, (steps, slots, 2, 2)))
+    poses = np.zeros((steps, 3))
+    report = judge(poses, poses, np.broadcast_to(np.eye(3), (steps, 3, 3)), innovations=given)
+    pairs = seen.sum() - slots
+    found = np.array(list(report["innovation_lag_one"].values()))
+    assert list(report["innovation_lag_one_band_95"].values()) == pytest.approx([1.96 / math.sqrt(pairs)] * 2)
+    # The estimate's standard error is sqrt((1 - rho²) / pairs).
+    assert np.all(np.abs(found - rho) < 4 * math.sqrt((1 - rho**2) / pairs))
+    assert np.all(np.abs(found) < 1.96 / math.sqrt(pairs)) == (rho == 0)
+
+
+def test_a_run_with_wild_innovations_weighs_no_more_than_any_other():
+    made = drives()
+    nu = made.nu.copy()
+    nu[0] = 1e6 * np.abs(nu[0])  # lag one of nearly 1
+    report = judge(made.truth, made.mean, made.cov, innovations=Innovations(nu, made.S))
+    healthy = judge(made.truth, made.mean, made.cov, innovations=innovations(made))
+    for name, value in report["innovation_lag_one"].items():
+        assert 0 < value - healthy["innovation_lag_one"][name] < 2 / RUNS
 
 
 @pytest.mark.parametrize(("scale", "side"), [(0.25, "over-confident"), (4.0, "under-confident")])

@@ -16,7 +16,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxlocmap import GridSpec, Params, batching, init, run, simulate
 from jaxlocmap.consistency import COVERAGE_LEVELS
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.scoring import NEES_EDGES, PHASES, Averages
+from jaxlocmap.scoring import NEES_EDGES, PHASES, Averages, Undiverged
 from jaxlocmap.simulate import CAPSTONE, LOOP, Noise
 from jaxlocmap.study import MapTotals, Study, Totals, median_nees, summarise
 
@@ -305,21 +305,25 @@ def score(truth, valid, gate, ok, of_map, exact_start=True, *, mean, cov, innova
         accepted[k] += white @ white < threshold
         if j in latest:
             products += white * latest[j]
-            squares += white**2
+            squares += white**2 + latest[j] ** 2
             pairs += 1
         latest[j] = white
     count = max(scored.sum(), 1)
     average = Averages(
         nees=nees.sum() / count,
-        axis_nees=axis.sum(0) / count,
         within_two_sigma=(scored[:, None] & (square <= 4 * variance)).sum(0) / count,
         covered=np.array([(scored & (nees < scipy.stats.chi2.ppf(level, 3))).sum() for level in COVERAGE_LEVELS])
         / count,
     )
     parts = [slice(-(-i * len(nees) // PHASES), -(-(i + 1) * len(nees) // PHASES)) for i in range(PHASES)]
     whole = scored.all()
-    phase_nees = whole * np.array([nees[part].mean() for part in parts])
     run_nis, kept = nis.sum() / max(observed.sum(), 1), scored.any() and ended and not lost
+    undiverged = Undiverged(
+        nees=kept * average.nees,
+        axis_nees=kept * axis.sum(0) / count,
+        phase_nees=kept * whole * np.array([nees[part].mean() for part in parts]),
+    )
+    lag = 2 * products / squares if pairs else np.zeros(2)
     bins = np.zeros(len(NEES_EDGES) + 1)
     bins[np.searchsorted(NEES_EDGES, average.nees, side="right")] += scored.any()
     return Totals(
@@ -332,10 +336,10 @@ def score(truth, valid, gate, ok, of_map, exact_start=True, *, mean, cov, innova
         variance=tuple(variance.T),
         average=average,
         average_square=jax.tree.map(np.square, average),
-        whole_runs=whole,
-        phase_nees=np.stack([phase_nees, phase_nees**2]),
-        kept_runs=kept,
-        kept_nees=kept * np.array([average.nees, average.nees**2]),
+        undiverged_runs=kept,
+        whole_runs=kept * whole,
+        undiverged=undiverged,
+        undiverged_square=jax.tree.map(np.square, undiverged),
         nees_bins=bins,
         run_nis=np.array([run_nis, run_nis**2]),
         observing_runs=observed.any(),
@@ -343,9 +347,8 @@ def score(truth, valid, gate, ok, of_map, exact_start=True, *, mean, cov, innova
         unscored_observations=unscored,
         nis=nis,
         accepted=accepted,
-        lag_products=products,
-        lag_squares=squares,
-        lag_spread=np.stack([products**2, products * squares, squares**2]),
+        lag_one=np.stack([lag, lag**2]),
+        lag_runs=pairs > 0,
         lag_pairs=pairs,
         flagged_steps=np.sum(~ok),
         diverged=lost or not ended,
@@ -704,16 +707,14 @@ def hand_made():
         error_square=(np.array([0.02, 0.06]), np.array([0.03, 0.05]), np.array([0.2, 0.12])),
         variance=(np.array([0.08, 0.5]), np.array([0.02, 0.72]), np.array([0.5, 0.02])),
         exact_starts=np.array(0.0),
-        average=Averages(
-            np.array(6.0), np.array([1.0, 2.0, 3.0]), np.array([2.0, 1.5, 1.0]), np.array([0.5, 1.0, 1.5, 2.0])
+        average=Averages(np.array(6.0), np.array([2.0, 1.5, 1.0]), np.array([0.5, 1.0, 1.5, 2.0])),
+        average_square=Averages(  # averages 2 and 4; shares 1 and 1, 0.5 and 1, 0.5 and 0.5; ...
+            np.array(20.0), np.array([2.0, 1.25, 0.5]), np.array([0.25, 0.5, 1.25, 2.0])
         ),
-        average_square=Averages(  # averages 2 and 4; 0.2 and 0.8, 0.5 and 1.5, 1 and 2; ...
-            np.array(20.0), np.array([0.68, 2.5, 5.0]), np.array([2.0, 1.25, 0.5]), np.array([0.25, 0.5, 1.25, 2.0])
-        ),
-        whole_runs=np.array(2.0),
-        phase_nees=np.array([[8.0, 0.0, 4.0, 0.0], [34.0, 0.0, 10.0, 0.0]]),
-        kept_runs=np.array(1.0),
-        kept_nees=np.array([2.0, 4.0]),
+        undiverged_runs=np.array(1.0),
+        whole_runs=np.array(1.0),
+        undiverged=Undiverged(np.array(2.0), np.array([0.5, 1.0, 1.5]), np.array([3.0, 0.0, 1.0, 0.0])),
+        undiverged_square=Undiverged(np.array(4.0), np.array([0.25, 1.0, 2.25]), np.array([9.0, 0.0, 1.0, 0.0])),
         nees_bins=np.bincount(np.searchsorted(NEES_EDGES, [2.0, 4.0], "right"), minlength=len(NEES_EDGES) + 1),
         run_nis=np.array([5.0, 17.0]),  # averages 1 and 4
         observing_runs=np.array(2.0),
@@ -721,9 +722,8 @@ def hand_made():
         unscored_observations=np.array(3.0),
         nis=np.array([0.0, 5.0]),
         accepted=np.array([0.0, 1.0]),
-        lag_products=np.array([1.0, -2.0]),
-        lag_squares=np.array([4.0, 4.0]),
-        lag_spread=np.array([[1.0, 2.0], [2.0, -4.0], [8.0, 8.0]]),
+        lag_one=np.array([[0.5, -1.0], [0.17, 0.58]]),  # 0.1 and 0.4, -0.3 and -0.7
+        lag_runs=np.array(2.0),
         lag_pairs=np.array(16.0),
         flagged_steps=np.array(1.0),
         diverged=np.array(1.0),
@@ -780,12 +780,15 @@ def test_a_report_of_totals_made_by_hand():
     assert report["nees_band_95"] == pytest.approx(np.array(scipy.stats.chi2.interval(0.95, 6)) / 2)
     assert report["nis_chi2_band_95"][0] is None
     assert report["nis_chi2_band_95"][1] == pytest.approx(np.array(scipy.stats.chi2.interval(0.95, 4)) / 2)
-    # One degree of freedom again: the spread of each run's products around the correlation times its squares.
-    spread = np.sqrt(2 * np.array([1 - 2 * 0.25 * 2 + 0.25**2 * 8, 2 - 2 * 0.5 * 4 + 0.5**2 * 8])) / 4
-    assert list(report["innovation_lag_one_band_95"].values()) == pytest.approx(12.7062 * spread, abs=1e-4)
-    # Standard errors of two runs are half their distance: x 0.2 and 0.8.
-    assert report["axis_nees_interval_95"]["x"] == pytest.approx((0.5 - 12.706 * 0.3, 0.5 + 12.706 * 0.3), abs=1e-3)
-    assert [phase["anees"] for phase in report["nees_phases"]] == [4.0, 0.0, 2.0, 0.0]
+    # One degree of freedom again; standard errors of two runs are half their distance.
+    assert list(report["innovation_lag_one_band_95"].values()) == pytest.approx(
+        12.7062 * np.array([0.15, 0.2]), abs=1e-4
+    )
+    assert report["within_two_sigma_interval_95"]["y"] == pytest.approx(
+        (0.75 - 12.706 / 4, 0.75 + 12.706 / 4), abs=1e-3
+    )
+    assert report["axis_nees_interval_95"]["x"] == (-math.inf, math.inf)  # of the one run that has not diverged
+    assert [phase["anees"] for phase in report["nees_phases"]] == [3.0, 0.0, 1.0, 0.0]
     assert 2.0 <= report["anees_median_run"] <= 2.0 * math.exp(0.05)  # the lower one of two
     assert "; 1 of 2 runs diverged" in report["verdict"]
     assert report["map"] == {

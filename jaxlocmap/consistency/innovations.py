@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxlocmap import checks
 from jaxlocmap.consistency.report import by_component, gate_verdict
-from jaxlocmap.consistency.statistics import average, chi2_band, lag_correlation, student_t, whiten
+from jaxlocmap.consistency.statistics import average, chi2_band, mean_lag_one, whiten
 
 
 class Innovations(NamedTuple):
@@ -112,21 +112,21 @@ def _whiteness(white: np.ndarray, scored: np.ndarray, landmark: ArrayLike | None
     if of.size != scored.size:
         raise ValueError(f"landmark: expected shape {scored.shape}, got {of.shape}")
     of = of.reshape(scored.shape)
-    products, squares, pairs = np.zeros((runs, size)), np.zeros((runs, size)), 0
+    correlations, pairs = [], 0
     for run in range(runs):
         step, slot = np.nonzero(scored[run])
         order = np.lexsort((step, of[run, step, slot]))
         values, ids = white[run, step, slot][order], of[run, step, slot][order]
         same = ids[1:] == ids[:-1]
-        products[run] = np.sum((values[1:] * values[:-1])[same], axis=0)
-        squares[run] = np.sum((values[1:] ** 2)[same], axis=0)
-        pairs += int(same.sum())
-    spread = np.stack([products**2, products * squares, squares**2]).sum(1)
-    correlation, error = lag_correlation(products.sum(0), squares.sum(0), spread, runs, pairs)
-    reach = student_t(runs) if runs > 1 else 1.96
+        if same.any():
+            before, after = values[:-1][same], values[1:][same]
+            correlations.append(2 * np.sum(before * after, axis=0) / np.sum(before**2 + after**2, axis=0))
+            pairs += int(same.sum())
+    each = np.reshape(correlations, (-1, size))
+    correlation, reach = mean_lag_one(each.sum(0), np.square(each).sum(0), len(each), pairs)
     return {
         "innovation_lag_one": by_component(correlation),
-        "innovation_lag_one_band_95": by_component(reach * error),
+        "innovation_lag_one_band_95": by_component(reach),
     }
 
 

@@ -196,13 +196,15 @@ def _means(nees: np.ndarray, axis: np.ndarray, diverged: np.ndarray, time: np.nd
     edges = np.unique(np.arange(_PHASES + 1) * steps // _PHASES)
     spans = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
     whole = average(nees, POSE_DIMENSION)
+    # One run is judged as it is; so are many that have all diverged.
+    kept = ~diverged if len(nees) > 1 and not diverged.all() else slice(None)
     means = PoseMeans(
         nees=whole,
-        kept_nees=average(nees[~diverged], POSE_DIMENSION) if 0 < diverged.sum() < len(nees) else whole,
-        axis_nees=tuple(average(axis[..., i], 1) for i in range(3)),
+        undiverged_nees=average(nees[kept], POSE_DIMENSION),
+        axis_nees=tuple(average(axis[kept, :, i], 1) for i in range(3)),
         within_two_sigma=tuple(shares(axis[..., i] <= 4, WITHIN_TWO_SIGMA) for i in range(3)),
         covered=tuple(shares(nees < chi2_quantile(level, POSE_DIMENSION), level) for level in COVERAGE_LEVELS),
-        phases=tuple(_phase(nees, span, whole) for span in spans),
+        phases=tuple(_phase(nees[kept], span, whole) for span in spans),
         phase_spans=tuple((float(time[span.start]), float(time[span.stop - 1])) for span in spans),
     )
     return means, spans

@@ -19,7 +19,8 @@ from jaxlocmap.consistency.statistics import (
 
 AXES = ("x", "y", "yaw")
 _TOLERANCE = 0.01  # a misfit that is there, and that no one need mind
-_LITTLE = 1.25  # up to such a factor an exact start or a gate may be what moves the ANEES
+_LITTLE = 1.25  # up to such a factor an exact start or a gate may be what moves the ANEES,
+_LITTLE_AXIS = 1.5  # and up to such a one, that of a single axis
 _ALIKE = 1.05  # axes whose variances are off by factors this close share one
 _SURE = 0.999  # what an axis is found wrong with, there being three of them
 _WIDE = 0.25  # of what is expected: a band this wide tells little
@@ -33,7 +34,7 @@ class PoseMeans(NamedTuple):
     """Means of the pose's statistics, over runs or over the steps of one."""
 
     nees: Mean  # 3 expected
-    kept_nees: Mean  # the same without runs that diverged
+    undiverged_nees: Mean  # the same of the runs that have not diverged, as are axes and phases
     axis_nees: tuple[Mean, ...]  # x, y, yaw: error² / σ², 1 expected
     within_two_sigma: tuple[Mean, ...]  # x, y, yaw: 0.954 expected
     covered: tuple[Mean, ...]  # one for each of `COVERAGE_LEVELS`
@@ -50,6 +51,7 @@ class Basis(NamedTuple):
     exact_start: bool = False  # the true start is the prior's mean, of which the filter's prior knows nothing
     gate: bool = False
     reference: PoseMeans | None = None  # of a filter told the robot's own noise: same start, same gate
+    reference_diverged: tuple[int, int] = (0, 0)  # its diverged runs, and all its runs
 
 
 def pose_fields(means: PoseMeans) -> dict[str, Any]:
@@ -70,6 +72,7 @@ def pose_fields(means: PoseMeans) -> dict[str, Any]:
             for (begin, end), phase in zip(means.phase_spans, means.phases, strict=True)
         ],
         # Where one axis is claimed too well and another too badly, the NEES of all three can look right.
+        # Phases and axes are those of undiverged runs: a single lost one would outweigh the others.
         "axis_nees": _by_axis(means.axis_nees, "value"),
         "axis_nees_interval_95": _by_axis(means.axis_nees, "interval_95"),
         "within_two_sigma": _by_axis(means.within_two_sigma, "value"),
@@ -118,14 +121,15 @@ def verdict(means: PoseMeans, basis: Basis) -> str:
     the prior or beside a reference, and where x, y and yaw are off by the same one within their errors. Elsewhere the
     axes are named. What an exact start or a gate does by itself is not blamed on the filter.
     """
-    lost = f"{basis.diverged} of {basis.runs} runs diverged" if basis.diverged else ""
-    if basis.diverged and basis.gate:
-        lost += ", which a gate can bring about by itself: it refuses what would correct them"
+    lost, honest_losses = _losses(basis)
     if not basis.steps and basis.diverged:
         return _joined("not consistent: no NEES is finite", lost)
+    if basis.diverged and basis.diverged == basis.runs:
+        return _joined(f"not consistent: ANEES {readable(means.nees.value, 4)}", lost)
     if not basis.steps or (basis.runs == 1 and basis.steps < _FEW_STEPS):
         return f"no verdict: {basis.steps} scored steps, at least {_FEW_STEPS} of one run expected"
-    judged, reference = _judged(means), _judged(basis.reference) if basis.reference is not None else None
+    judged = means.undiverged_nees
+    reference = None if basis.reference is None else basis.reference.undiverged_nees
     relative = _relative(judged, reference, POSE_DIMENSION)
     expected = POSE_DIMENSION if reference is None else reference.value
     low, high = (expected * limit for limit in relative.band_95)
@@ -148,10 +152,10 @@ def verdict(means: PoseMeans, basis: Basis) -> str:
             return _joined(f"undecided: {stated}, {band}: too few to tell", lost)
         if axes and not _disturbed(basis, axes):
             return _joined(f"not consistent: {stated} lies in {band}, but {_in_words(axes, basis)}", lost)
-        opening = "not consistent" if lost else "consistent"
+        opening = "consistent" if honest_losses else "not consistent"
         return _joined(f"{opening}: {stated} lies in {band}", lost)
-    if off <= _TOLERANCE and not lost:
-        return f"consistent within {100 * _TOLERANCE:g} %: {stated}, {band}"
+    if off <= _TOLERANCE and honest_losses:
+        return _joined(f"consistent within {100 * _TOLERANCE:g} %: {stated}, {band}", lost)
     cause = _cause(basis, relative.value)
     if cause and 1 / _LITTLE < relative.value < _LITTLE and _disturbed(basis, axes):
         return _joined(f"undecided: {stated} lies outside {band}, which {cause} can bring about by itself", lost)
@@ -168,9 +172,19 @@ def verdict(means: PoseMeans, basis: Basis) -> str:
     return _joined(f"{side}: {size} {judged_by}{_when(means, basis)}", lost)
 
 
-def _judged(means: PoseMeans) -> Mean:
-    """The NEES of the runs that have not diverged, if there are any."""
-    return means.kept_nees if means.kept_nees.samples else means.nees
+def _losses(basis: Basis) -> tuple[str, bool]:
+    """Diverged runs in words, and whether an honest filter loses as many."""
+    if not basis.diverged:
+        return "", True
+    words = f"{basis.diverged} of {basis.runs} runs diverged"
+    count, runs = basis.reference_diverged
+    if runs:
+        (least, _), (_, most) = binomial_interval(basis.diverged, basis.runs), binomial_interval(count, runs)
+        words += f", {count} of {runs} of the filter told the robot's own noise"
+        return words, least <= most
+    if basis.gate:
+        words += ", which a gate can bring about by itself: it refuses what would correct them"
+    return words, False
 
 
 def _has_factor(basis: Basis) -> bool:
@@ -214,9 +228,10 @@ def _wrong_axes(means: PoseMeans, basis: Basis) -> dict[str, Mean]:
 
 
 def _disturbed(basis: Basis, axes: dict[str, Mean]) -> bool:
-    """Whether an exact start or a gate may be what moves these axes."""
-    small = all(1 / _LITTLE < axis.value < _LITTLE for axis in axes.values())
-    return small and basis.reference is None and (basis.exact_start or basis.gate)
+    """Whether an exact start, which only lowers, or a gate, which only raises, may be what moves these axes."""
+    low = 1 / _LITTLE_AXIS if basis.exact_start else 1.0
+    high = _LITTLE_AXIS if basis.gate else 1.0
+    return basis.reference is None and all(low < axis.value < high for axis in axes.values())
 
 
 def _share_a_factor(means: PoseMeans, basis: Basis) -> bool:

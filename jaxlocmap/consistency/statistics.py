@@ -122,27 +122,6 @@ def whiten(innovation: jax.Array, S: jax.Array) -> jax.Array:
     return jnp.stack([y / jnp.sqrt(d) for y, d in zip(forward(L, tuple(innovation)), D, strict=True)])
 
 
-def lag_one(white: jax.Array, observed: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Products of each whitened innovation with the one before it of the same landmark: their sum is zero on average
-    for a consistent filter (Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2).
-
-    Args:
-        white: (T, M, m) from `whiten`, column j always the same landmark. observed: (T, M) bool.
-
-    Returns:
-        (m,) sum of products, (m,) sum of squares of the later member of each pair, () number of pairs. The
-        autocorrelation is the first over the second; its 95 % band is ±1.96 / √pairs.
-    """
-    steps = jnp.arange(len(observed))[:, None]
-    latest = jax.lax.cummax(jnp.where(observed, steps, -1), axis=0)
-    before = jnp.concatenate([jnp.full_like(latest[:1], -1), latest[:-1]])
-    paired = (observed & (before >= 0))[..., None]
-    previous = jnp.take_along_axis(white, jnp.maximum(before, 0)[..., None], axis=0)
-    products = jnp.where(paired, white * previous, 0)
-    squares = jnp.where(paired, white * white, 0)
-    return products.sum((0, 1)), squares.sum((0, 1)), paired.sum().astype(white.dtype)
-
-
 def chi2_quantile(probability: float, degrees: int) -> float:
     """The value a χ² variable with `degrees` degrees of freedom stays below with `probability`.
 
@@ -311,18 +290,25 @@ def binomial_interval(count: int, trials: int, probability: float = 0.95) -> tup
     return low, high
 
 
-def lag_correlation(
-    products: np.ndarray, squares: np.ndarray, spread: np.ndarray, runs: int, pairs: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Correlation at lag one and its standard error: between runs where there are several, else 1 / √pairs.
+def mean_lag_one(total: np.ndarray, square: np.ndarray, runs: int, pairs: float) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation of each innovation with the one before it of the same landmark, and how far it may be off.
+
+    Of one run it is 2 Σ aₖ bₖ / Σ (aₖ² + bₖ²) over its pairs of whitened innovations: never beyond ±1, whatever a run
+    that has lost the robot makes of them, and 0 on average for a consistent filter. Of many runs it is their mean.
 
     Args:
-        products, squares: (m,) sums over runs of each run's own sums.
-        spread: (3, m) sums over runs of products², products * squares and squares².
+        total, square: (m,) sums over runs of the run's correlation and of its square, for each component.
+        runs: that have any pair. pairs: of all runs.
+
+    Returns:
+        (m,) the mean and (m,) half the width of its 95 % interval: from the spread between runs, of a single run
+        1.96 / √pairs.
+        Source: Burg 1975 (the correlation); Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2 (the test).
     """
-    safe = np.where(squares > 0, squares, np.nan)
-    correlation = products / safe
-    if runs < 2:
-        return correlation, np.full_like(correlation, 1 / math.sqrt(pairs) if pairs else math.nan)
-    residual = spread[0] - 2 * correlation * spread[1] + correlation**2 * spread[2]
-    return correlation, np.sqrt(np.maximum(residual, 0) * runs / (runs - 1)) / safe
+    if not runs:
+        return np.full_like(total, np.nan), np.full_like(total, np.nan)
+    mean = total / runs
+    if runs == 1:
+        return mean, np.full_like(mean, 1.96 / math.sqrt(pairs))
+    spread = np.maximum(square / runs - mean**2, 0) / (runs - 1)
+    return mean, student_t(runs) * np.sqrt(spread)
