@@ -31,6 +31,8 @@ def course_draws(seed: int, scenario: simulate.Scenario, landmarks: int) -> simu
     """Standard normals in the order in which the course's program asks for them: a step's heading, speed and yaw
     rate, range and bearing of each landmark when the detector looks, then the beams.
     """
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed: expected 0 to 2³² - 1, as NumPy's RandomState has it, got {seed}")
     generator = np.random.RandomState(seed)
     drive, sighting, scan = [], [], []
     for k in range(scenario.steps):

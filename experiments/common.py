@@ -188,6 +188,16 @@ def scenario_of(name: str) -> simulate.Scenario:
     return simulate.SCENARIOS[name]
 
 
+def check_gate(gate: float | None, name: str = "gate") -> None:
+    """Raise unless this is what a gate can let in.
+
+    Raises:
+        ValueError: no probability inside (0, 1).
+    """
+    if gate is not None and not 0 < gate < 1:
+        raise ValueError(f"{name}: expected a probability inside (0, 1), or None for no gate, got {gate}")
+
+
 def params_or(path: Path | None, default: Params) -> Params:
     """The parameters in a file, or the default."""
     return default if path is None else Params.load(path)

@@ -13,6 +13,7 @@ import tyro
 from common import (
     CONSOLE,
     ComputeConfig,
+    check_gate,
     command_line,
     finish,
     how_computed,
@@ -27,6 +28,7 @@ from common import (
     study_parts,
     write_report,
 )
+from report_table import band, innovation_rows, pose_rows, print_verdicts
 
 from jaxlocmap import Config, Params, init, plotting, run, simulate
 from jaxlocmap.consistency import readable
@@ -66,6 +68,7 @@ class ConsistencyConfig:
 def main(config: ConsistencyConfig) -> dict[str, Any]:
     """Run the study, write the report and the figures."""
     out = output_folder(config.out)
+    check_gate(config.gate)
     scenario = scenario_of(config.scenario)
     if config.start is not None:
         scenario = dataclasses.replace(scenario, exact_prior=config.start == "exact")
@@ -150,56 +153,20 @@ def _poses(state: Any, info: Any, aside: Any) -> jax.Array:
 
 
 def _print(report: dict[str, Any]) -> None:
-    def band(name: str, scale: float = 1) -> str:
-        return "[{:.4g}, {:.4g}]".format(*(scale * limit for limit in report[name]))
-
-    def by_axis(field: str, words: str, expected: str, scale: float, unit: str) -> list[tuple[str, str, str]]:
-        limits = report[f"{field}_interval_95"]
-        return [
-            (f"{axis} {words}", f"{scale * value:.4g}{unit} [{scale * low:.4g}, {scale * high:.4g}]", expected)
-            for axis, value in report[field].items()
-            for low, high in [limits[axis]]
-        ]
-
-    lag, lag_band = report["innovation_lag_one"], report["innovation_lag_one_band_95"]
-    gated = report["gate_nominal_rate"] is not None
     rows = [
-        ("ANEES (3 degrees)", f"{report['anees']:.3f}", f"{band('anees_band_95')} (spread between runs)"),
+        *pose_rows(report),
         ("median run's average NEES", f"{report['anees_median_run']:.3g}", ""),
-        ("ANEES of undiverged runs", f"{report['anees_undiverged']:.3f} {band('anees_undiverged_interval_95')}", ""),
+        (
+            "ANEES of undiverged runs",
+            f"{report['anees_undiverged']:.3f} {band(report, 'anees_undiverged_interval_95')}",
+            "",
+        ),
         (
             "steps inside the NEES band",
-            f"{100 * report['nees_steps_in_band']:.1f} % {band('nees_steps_in_band_interval_95', 100)}",
+            f"{100 * report['nees_steps_in_band']:.1f} % {band(report, 'nees_steps_in_band_interval_95', 100)}",
             "95 %",
         ),
-        ("NIS (2 degrees)", f"{report['nis_mean']:.3f}", band("nis_band_95")),
-        *(
-            (
-                f"{level} % ellipsoid holds",
-                f"{100 * report[name]:.1f} % {band(name + '_interval_95', 100)}",
-                f"{level} %",
-            )
-            for level in (50, 90, 95, 99)
-            for name in [f"coverage_{level}"]
-        ),
-        *by_axis("axis_nees", "alone: error² over σ²", "1", 1, ""),
-        *by_axis("within_two_sigma", "within ±2σ", "95.4 %", 100, " %"),
-        *(
-            (
-                f"innovation lag one, {name}",
-                f"{value:+.4f} ± {lag_band[name]:.4f}",
-                "not 0 behind a gate" if gated else "0",
-            )
-            for name, value in lag.items()
-        ),
-        (
-            "gate lets in",
-            f"{100 * report['gate_accept_rate']:.3f} %",
-            f"{100 * report['gate_nominal_rate']:g} %" if gated else "100 %",
-        ),
-        ("position RMSE", f"{report['rmse_position_m']:.4f} m", ""),
-        ("yaw RMSE", f"{report['rmse_yaw_rad']:.4f} rad", ""),
-        ("diverged runs", str(report["diverged_runs"]), "0"),
+        *innovation_rows(report),
         ("flagged steps", str(report["flagged_steps"]), "0"),
     ]
     for phase in report["nees_phases"]:
@@ -213,8 +180,7 @@ def _print(report: dict[str, Any]) -> None:
             ("map Brier score", f"{report['map']['brier']:.4f}", f"0 is perfect, {known:.3f} knows only how many"),
         ]
     show(f"{report['scenario']}, {report['motion']} motion, {report['runs']} runs", rows)
-    CONSOLE.print(f"[bold]{report['verdict']}[/bold]", highlight=False)
-    CONSOLE.print(report["gate_verdict"], highlight=False)
+    print_verdicts(report)
     CONSOLE.print(
         f"{report['runs_per_s']:.0f} runs/s after {report['compile_s']:.1f} s of compilation, in chunks of "
         f"{report['chunk']} runs on {report['devices']} device(s) of {report['processes']} process(es)",

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import CONSOLE, command_line, count_rows, output_folder, progress_bar, saved, show, write_report
+from common import CONSOLE, check_gate, command_line, count_rows, output_folder, progress_bar, saved, show, write_report
+from report_table import innovation_rows, pose_rows, print_verdicts
 
 from jaxlocmap import consistency, plotting
 from jaxlocmap.consistency import Innovations, judge, readable
@@ -43,8 +44,7 @@ class JudgeConfig:
 def main(config: JudgeConfig) -> dict[str, Any]:
     """Judge, write the report and the figure."""
     out = output_folder(config.out)
-    if config.gate is not None and not 0 < config.gate < 1:
-        raise ValueError(f"gate: expected a probability inside (0, 1), or None for no gate, got {config.gate}")
+    check_gate(config.gate)
     if config.innovations and len(config.innovations) != len(config.estimate):
         raise ValueError(
             f"innovations: expected one file for each of the {len(config.estimate)} estimates, "
@@ -116,39 +116,12 @@ def _first(pairs: Pairs, innovations: Innovations | None, steps: int) -> tuple[P
 
 
 def _print(report: dict[str, Any], title: str) -> None:
-    def interval(name: str, scale: float = 1) -> str:
-        low, high = report[name]
-        return f"[{scale * low:.4g}, {scale * high:.4g}]"
-
     rows = [
         ("runs, steps, steps scored", f"{report['runs']}, {report['steps']}, {report['scored_steps']}", ""),
         ("independent samples", readable(report["independent_samples"]), ""),
-        ("ANEES (3 degrees)", readable(report["anees"], 4), interval("anees_band_95")),
         ("median NEES", readable(report["nees_median"]), f"{consistency.chi2_quantile(0.5, 3):.2f}"),
-    ]
-    rows += [
-        (f"{level} % ellipsoid holds", f"{100 * report[f'coverage_{level}']:.1f} % {interval(name, 100)}", f"{level} %")
-        for level in (50, 90, 95, 99)
-        for name in [f"coverage_{level}_interval_95"]
-    ]
-    for field, words, expected, scale, unit in (
-        ("axis_nees", "alone: error² over σ²", "1", 1, ""),
-        ("within_two_sigma", "within ±2σ", "95.4 %", 100, " %"),
-    ):
-        for axis, value in report[field].items():
-            low, high = (scale * limit for limit in report[f"{field}_interval_95"][axis])
-            rows.append((f"{axis} {words}", f"{readable(scale * value)}{unit} [{low:.3g}, {high:.3g}]", expected))
-    if "nis_mean" in report:
-        degrees = report["nis_degrees"]
-        rows.append((f"NIS ({degrees} degrees)", f"{report['nis_mean']:.3f}", interval("nis_band_95")))
-        rows += [
-            (f"innovation lag one, {name}", f"{value:+.4f}", f"±{report['innovation_lag_one_band_95'][name]:.4f}")
-            for name, value in report["innovation_lag_one"].items()
-        ]
-    rows += [
-        ("position RMSE", f"{report['rmse_position_m']:.4g} m", ""),
-        ("yaw RMSE", f"{report['rmse_yaw_rad']:.4g} rad", ""),
-        ("runs that lost the robot", str(report["diverged_runs"]), "0"),
+        *pose_rows(report),
+        *(innovation_rows(report) if "nis_mean" in report else []),
     ]
     show(title, rows + count_rows(report["counts"]))
     for span in report["dishonest"]:
@@ -158,9 +131,7 @@ def _print(report: dict[str, Any], title: str) -> None:
             f"y {y0:.3g} to {y1:.3g} m): NEES {readable(span['anees'])}",
             highlight=False,
         )
-    CONSOLE.print(f"[bold]{report['verdict']}[/bold]", highlight=False)
-    if "gate_verdict" in report:
-        CONSOLE.print(report["gate_verdict"], highlight=False)
+    print_verdicts(report)
 
 
 if __name__ == "__main__":

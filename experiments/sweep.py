@@ -21,6 +21,7 @@ import tyro
 from common import (
     CONSOLE,
     ComputeConfig,
+    check_gate,
     command_line,
     finish,
     how_computed,
@@ -182,6 +183,7 @@ def main(config: SweepConfig) -> dict[str, Any]:
     """Run the sweep, write the report and the figure."""
     out = output_folder(config.out)
     x, y = _grid(config)
+    check_gate(config.gate)
     scenario = scenario_of(config.scenario)
     if config.runs < 2:
         raise ValueError(f"runs: expected at least 2, which a band needs, got {config.runs}")

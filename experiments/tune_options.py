@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Literal
 
+from common import check_gate
 from tune_sources import JUDGE_GATE, TUNING_GATE
 
 from jaxlocmap import tuning
@@ -135,13 +136,11 @@ def _check_values(config: TuneConfig) -> None:
         if value is not None and not 0 < value < math.inf:
             raise ValueError(f"{name}: expected {unit} > 0, finite, got {value}")
     for name in ("gate", "judge_gate"):
-        value = getattr(config, name)
-        if value is not None and not 0 < value < 1:
-            raise ValueError(f"{name}: expected a probability inside (0, 1), or None for no gate, got {value}")
-    for name in ("robots", "judged"):
-        robots = getattr(config, name) or ()
-        if len(set(robots)) < len(robots):
-            raise ValueError(f"{name}: expected each robot once, got {robots}")
+        check_gate(getattr(config, name), name)
+    for name in ("robots", "judged", "tune"):
+        given = getattr(config, name) or ()
+        if len(set(given)) < len(given):
+            raise ValueError(f"{name}: expected each once, got {' '.join(map(str, given))}")
 
 
 def _check_combinations(config: TuneConfig) -> None:
@@ -154,6 +153,11 @@ def _check_combinations(config: TuneConfig) -> None:
         raise ValueError("full: applies where Q and R are tuned and --tune is not given: expected it not to be given")
     if config.format == "carmen" and losses != ["map"]:
         raise ValueError(f"loss: a carmen log has no landmarks: expected `map` alone, got {', '.join(losses)}")
+    noise = [name for name in config.tune or () if name not in tuning.SENSOR_MODEL]
+    if config.format == "carmen" and noise:
+        raise ValueError(
+            f"tune: a carmen log's map depends on {', '.join(tuning.SENSOR_MODEL)} alone, got {', '.join(noise)}"
+        )
     if config.format in _LOGS_OF_ROBOTS and "map" in losses:
         raise ValueError(f"loss: expected none of a map, for the format {config.format} has no scans, got `map`")
 

@@ -153,7 +153,8 @@ class Config:
     motion: Any = "arc"  # "euler" | "arc" | "capstone" | motion.MotionModel
     gate_probability: Any = 0.99  # in (0, 1): share of good observations let in; None: no gate
     gate_softness: float = 0.0  # >= 0, of the squared distance: 0 decides, more weighs (`ekf.update`), for derivatives
-    sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad: sensor in the body frame
+    # m, m, rad: where the landmark sensor sits in the body frame. Scans are mapped from the pose itself.
+    sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     grid: GridSpec | None = None  # None: localisation alone
     min_range: float = 0.05  # m: a range at or below is no measurement
     max_range: float = 8.0  # m: a range at or above clears cells up to here and marks none

@@ -19,7 +19,7 @@ class Timeline(NamedTuple):
     """A log as steps, float64 NumPy. The prior of a filter is the belief at `time[0]`, since `dt[0]` is 0."""
 
     time: np.ndarray  # (T,) s, strictly increasing
-    inputs: Inputs  # of NumPy arrays; `ranges` (T, B) m, NaN: no return or no scan at this step
+    inputs: Inputs  # of NumPy arrays; `ranges` (T, B) m, inf: no return, NaN: no measurement, or no scan at this step
     truth: np.ndarray  # (T, 3) m, m, rad at `time`, heading in [-pi, pi); NaN where not `truth_valid`
     truth_valid: np.ndarray  # (T,) bool
     counts: dict[str, float]  # what the reader and `to_timeline` dropped or repaired: how often, gaps also in s
@@ -70,18 +70,21 @@ def to_timeline(
         raise ValueError(f"max_range: expected metres > 0, or None, got {max_range}")
     if not max_gap > 0:
         raise ValueError(f"max_gap: expected seconds > 0, got {max_gap}")
-    _check_clocks(log)
+    if len(log.truth_time):
+        check_overlap(log.name, log.truth_time, log.odometry_time, "odometry")
     counts: dict[str, float] = dict(log.counts)
     streams = (log.odometry_time, log.sighting_time, log.scan_time)
-    counts["backward_stamps"] = sum(_backward(stream) for stream in streams)
-    odometry_rows = _last_at_each_stamp(log.odometry_time, counts, "duplicate_odometry")
+    counts["backward_stamps"] = sum(backward(stream) for stream in streams)
+    odometry_rows = last_at_each_stamp(log.odometry_time)
+    counts["duplicate_odometry"] = len(log.odometry_time) - len(odometry_rows)
     odometry_time, odometry = log.odometry_time[odometry_rows], log.odometry[odometry_rows]
     sighting_rows = _distinct_sightings(log, counts)
     if max_range is not None:
         near = log.sighting[sighting_rows, 0] < max_range
         counts["beyond_max_range"] = int(np.sum(~near))
         sighting_rows = sighting_rows[near]
-    scan_rows = _last_at_each_stamp(log.scan_time, counts, "duplicate_scans")
+    scan_rows = last_at_each_stamp(log.scan_time)
+    counts["duplicate_scans"] = len(log.scan_time) - len(scan_rows)
 
     first, last = _window(start, stop)
     seen, scanned = log.sighting_time[sighting_rows], log.scan_time[scan_rows]
@@ -111,8 +114,9 @@ def to_timeline(
         ranges = np.full((len(time), log.scan.shape[1]), np.nan)
         ranges[np.searchsorted(time, log.scan_time[scan_rows])] = log.scan[scan_rows]
     arrays: tuple[Any, ...] = (time - previous, control, landmark, z, valid, ranges)
-    counts["backward_truth"] = _backward(log.truth_time)
-    truth_rows = _last_at_each_stamp(log.truth_time, counts, "duplicate_truth")
+    counts["backward_truth"] = backward(log.truth_time)
+    truth_rows = last_at_each_stamp(log.truth_time)
+    counts["duplicate_truth"] = len(log.truth_time) - len(truth_rows)
     truth_time = log.truth_time[truth_rows]
     truth, truth_valid = interpolate(truth_time, log.truth[truth_rows], time, max_gap)
     after = np.searchsorted(truth_time, time[~truth_valid])
@@ -120,14 +124,20 @@ def to_timeline(
     return Timeline(time, Inputs(*arrays), truth, truth_valid, counts)
 
 
-def _check_clocks(log: Log) -> None:
-    """Raise unless truth, if there is any, and odometry share some time."""
-    truth, odometry = log.truth_time, log.odometry_time
-    if len(truth) and (truth.min() > odometry.max() or truth.max() < odometry.min()):
-        raise ValueError(
-            f"{log.name}: truth and odometry: no overlap in time: truth from {truth.min():.3f} to {truth.max():.3f} s, "
-            f"odometry from {odometry.min():.3f} to {odometry.max():.3f} s; do their clocks differ?"
+def check_overlap(name: str, truth: np.ndarray, time: np.ndarray, what: str) -> None:
+    """Raise unless two clocks have some time in common.
+
+    Args:
+        name: of the file. truth, time: s, in any order, of the truth and of `what`.
+
+    Raises:
+        ValueError: they have none; says what each spans.
+    """
+    if truth.min() > time.max() or truth.max() < time.min():
+        spans = ", ".join(
+            f"{of} from {stamps.min():.3f} to {stamps.max():.3f} s" for of, stamps in (("truth", truth), (what, time))
         )
+        raise ValueError(f"{name}: truth and {what}: no overlap in time: {spans}; do their clocks differ?")
 
 
 def _stands_from(name: str, odometry_time: np.ndarray, last: float, max_gap: float) -> np.ndarray:
@@ -147,15 +157,15 @@ def _stands_from(name: str, odometry_time: np.ndarray, last: float, max_gap: flo
     return np.where(holds, np.inf, odometry_time + usual)
 
 
-def _backward(time: np.ndarray) -> int:
+def backward(time: np.ndarray) -> int:
+    """How many stamps lie below the one before."""
     return int(np.sum(np.diff(time) < 0))
 
 
-def _last_at_each_stamp(time: np.ndarray, counts: dict[str, float], duplicates: str) -> np.ndarray:
+def last_at_each_stamp(time: np.ndarray) -> np.ndarray:
     """Rows in order of time; of rows with one stamp the last in the file."""
     order = np.argsort(time, kind="stable")
     keep = np.diff(time[order], append=np.inf) > 0
-    counts[duplicates] = int(np.sum(~keep))
     return order[keep]
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlocmap.logs.text import lines, numbers
-from jaxlocmap.logs.timeline import interpolate
+from jaxlocmap.logs.timeline import backward, check_overlap, interpolate, last_at_each_stamp
 
 _TUM = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UPPER = ("xx", "xy", "xt", "yy", "yt", "tt")  # of a covariance of x, y and theta
@@ -71,8 +71,9 @@ def read_trajectory(path: str | Path) -> Trajectory:
     else:
         names = _tum_columns(len(first.split()), f"{path}:{number}")
         table = _parsed(path, rows, names, None)
-    order, counts = _in_order(table["t"])
-    table = {name: values[order] for name, values in table.items()}
+    rows_kept = last_at_each_stamp(table["t"])
+    counts = {"backward_stamps": backward(table["t"]), "duplicate_stamps": len(table["t"]) - len(rows_kept)}
+    table = {name: values[rows_kept] for name, values in table.items()}
     theta = table["theta"] if "theta" in table else _yaw(table, path)
     pose = np.column_stack([table["x"], table["y"], theta])
     return Trajectory(table["t"], pose, _covariance(table), counts)
@@ -103,7 +104,7 @@ def pair(
     for run, (of_truth, estimate, name) in enumerate(zip(truths, estimates, names, strict=True)):
         if estimate.cov is None:
             raise ValueError(f"{name}: expected covariances to judge, got poses alone")
-        _check_overlap(of_truth.time, estimate.time, name)
+        check_overlap(name, of_truth.time, estimate.time, "estimate")
         steps = len(estimate.time)
         at, known = interpolate(of_truth.time, of_truth.pose, estimate.time, max_gap)
         truth[run, :steps], mean[run, :steps], cov[run, :steps] = at, estimate.pose, estimate.cov
@@ -225,14 +226,6 @@ def _parsed(
     return dict(zip(names, np.array(values).T, strict=True))
 
 
-def _in_order(time: np.ndarray) -> tuple[np.ndarray, dict[str, int]]:
-    """Rows in order of time; of rows with one stamp the last in the file."""
-    order = np.argsort(time, kind="stable")
-    keep = np.diff(time[order], append=np.inf) > 0
-    counts = {"backward_stamps": int(np.sum(np.diff(time) < 0)), "duplicate_stamps": int(np.sum(~keep))}
-    return order[keep], counts
-
-
 def _yaw(table: dict[str, np.ndarray], path: str | Path) -> np.ndarray:
     x, y, z, w = (table[name] for name in _QUATERNION)
     length = x * x + y * y + z * z + w * w
@@ -251,9 +244,3 @@ def _covariance(table: dict[str, np.ndarray]) -> np.ndarray | None:
     letters = "xyt"
     pairs = [[a + b if a + b in table else b + a for b in letters] for a in letters]
     return np.stack([np.stack([table[name] for name in row], -1) for row in pairs], -2)
-
-
-def _check_overlap(truth: np.ndarray, estimate: np.ndarray, name: str) -> None:
-    if truth[0] > estimate[-1] or estimate[0] > truth[-1]:
-        spans = " and ".join(f"{times[0]:.3f} to {times[-1]:.3f} s" for times in (truth, estimate))
-        raise ValueError(f"{name}: no overlap in time: truth and estimate are of {spans}")
