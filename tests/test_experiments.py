@@ -175,7 +175,7 @@ def test_a_resolution_too_fine_for_the_memory_is_refused(tmp_path):
     [
         ("consistency", ("--scenario", "moon"), "scenario"),
         ("consistency", ("--motion", "hover"), "motion"),
-        ("consistency", ("--gate", "1.5"), "gate_probability: expected a probability inside (0, 1)"),
+        ("consistency", ("--gate", "1.5"), "gate: expected a probability inside (0, 1)"),
         ("consistency", ("--runs", "0"), "runs: expected at least 1, got 0"),
         ("consistency", ("--params", "nowhere.json"), "nowhere.json"),
         ("consistency", ("--out", "/proc/nothing"), "out: expected a folder that can be written"),

@@ -454,7 +454,7 @@ GOOD = "t,x,y,theta,xx,xy,xt,yy,yt,tt\n0,0,0,0,1,0,0,1,0,1\n1,0,0,0,1,0,0,1,0,1\
         ("0 0 0 0 0 0 0 0\n", "expected a rotation, got a quaternion of length 0"),
         (
             GOOD.replace("\n0,", "\n5000,").replace("\n1,", "\n5001,"),
-            "no overlap in time: truth and estimate are of 0.000",
+            "truth and estimate: no overlap in time: truth from 0.000",
         ),
         (GOOD.replace("1,0,0,1,0,1\n", "\n", 1), "2: expected 10 columns"),
     ],
