@@ -6,37 +6,30 @@ made of.
 
 from jaxlocmap.consistency.innovations import Innovations
 from jaxlocmap.consistency.judge import judge
-from jaxlocmap.consistency.report import (
-    AXES,
-    Basis,
-    PoseMeans,
-    by_component,
-    gate_verdict,
-    pose_fields,
-    readable,
-    share_in_band,
-    verdict,
-)
-from jaxlocmap.consistency.statistics import (
-    COVERAGE_LEVELS,
-    POSE_DIMENSION,
-    WITHIN_TWO_SIGMA,
+from jaxlocmap.consistency.means import (
     Mean,
-    PoseScore,
     binomial_interval,
-    chi2_band,
-    chi2_quantile,
     correlation_time,
     mean_lag_one,
     mean_over_runs,
     mean_over_time,
+    ratio,
+    student_t,
+)
+from jaxlocmap.consistency.report import AXES, PoseMeans, by_component, pose_fields, share_in_band
+from jaxlocmap.consistency.statistics import (
+    COVERAGE_LEVELS,
+    POSE_DIMENSION,
+    WITHIN_TWO_SIGMA,
+    PoseScore,
+    chi2_band,
+    chi2_quantile,
     nees,
     pose_error,
-    ratio,
     score_pose,
-    student_t,
     whiten,
 )
+from jaxlocmap.consistency.verdict import Basis, gate_verdict, readable, verdict
 
 __all__ = [
     "AXES",

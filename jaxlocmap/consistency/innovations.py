@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxlocmap import checks
-from jaxlocmap.consistency.report import by_component, gate_verdict
-from jaxlocmap.consistency.statistics import average, chi2_band, mean_lag_one, whiten
+from jaxlocmap.consistency.means import average, mean_lag_one
+from jaxlocmap.consistency.report import by_component
+from jaxlocmap.consistency.statistics import chi2_band, whiten
+from jaxlocmap.consistency.verdict import gate_verdict
 
 
 class Innovations(NamedTuple):

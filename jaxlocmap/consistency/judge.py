@@ -12,20 +12,18 @@ from numpy.typing import ArrayLike
 
 from jaxlocmap import checks
 from jaxlocmap.consistency.innovations import Innovations, innovation_fields
-from jaxlocmap.consistency.report import Basis, PoseMeans, pose_fields, share_in_band, verdict
+from jaxlocmap.consistency.means import Mean, average, run_averages, student_t
+from jaxlocmap.consistency.report import PoseMeans, pose_fields, share_in_band
 from jaxlocmap.consistency.statistics import (
     COVERAGE_LEVELS,
     POSE_DIMENSION,
     WITHIN_TWO_SIGMA,
-    Mean,
     PoseScore,
-    average,
     chi2_band,
     chi2_quantile,
-    run_averages,
     score_pose,
-    student_t,
 )
+from jaxlocmap.consistency.verdict import Basis, verdict
 
 _PHASES = 10  # equal parts of a drive
 _SYMMETRIC = 1e-6  # of √(variance · variance): entries of a covariance may differ from their mirror images by so much
