@@ -22,8 +22,8 @@ from jaxlocmap import hosts, tuning
 from jaxlocmap.consistency import readable
 
 _ROBOTS = (1, 2, 3, 4, 5)
-# What `nees` is tuned by, which tells no more than two: on the first half its loss falls from 28 to 0.06 by these, to 16
-# or more by v and w or mixed pairs.
+# What `nees` is tuned by, which tells no more than two: on the first half its loss falls from 28 to 0.06 by these, to
+# 16 or more by v and w or mixed pairs.
 _TWO = ("range", "bearing")
 
 
