@@ -34,7 +34,7 @@ from jaxlocmap.study import Study, summarise
 
 _CLOSE = 1e-4  # nats: two losses this close are the same, a tenth of what 512 runs leave uncertain
 _LOSSES = ("state", "pose", "innovation", "nees", "nis")
-_TWO = ("w", "range")  # what `nees` and `nis` are tuned by, which tell no more than two
+_TWO = ("range", "bearing")  # what `nees` and `nis` are tuned by, which tell no more than two
 _SURE = 1 / 3  # of the robot's own deviations: where the second comparison starts
 _STEADY = simulate.LOOP  # whose prior is honest: an exact start would let a filter win that does not look
 
