@@ -23,12 +23,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxlocmap import Params, hosts, simulate
+from jaxlocmap import Params, files, hosts, simulate
 from jaxlocmap.monte_carlo import Result, monte_carlo
 from jaxlocmap.parts import Parts
 
 _README = Path(__file__).parent.parent / "README.md"
-CONSOLE = Console(width=min(100, Console().width) if sys.stdout.isatty() else 100)
+# A path or a name may hold what looks like markup.
+CONSOLE = Console(width=min(100, Console().width) if sys.stdout.isatty() else 100, markup=False, highlight=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +97,7 @@ def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -
         settings,
         resume=config.resume,
         discard=config.discard,
-        say=lambda sentence: CONSOLE.print(sentence, highlight=False, soft_wrap=True),
+        say=lambda sentence: CONSOLE.print(sentence, soft_wrap=True),
     )
 
 
@@ -206,7 +207,7 @@ def params_or(path: Path | None, default: Params) -> Params:
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar that is moved by calling with the number done so far."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=CONSOLE, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
@@ -214,7 +215,7 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:
     """`report.json`; a number that is not finite becomes null, which is what JSON has for it."""
-    (folder / "report.json").write_text(json.dumps(_plain(report), indent=1, allow_nan=False) + "\n")
+    files.write(folder / "report.json", json.dumps(_plain(report), indent=1, allow_nan=False) + "\n")
 
 
 def _plain(value: Any) -> Any:
@@ -258,4 +259,4 @@ def replace_table(name: str, table: str) -> None:
     _, ended, tail = rest.partition(end)
     if not (found and ended):
         raise ValueError(f"{_README}: expected the marks {begin.strip()} and {end}")
-    _README.write_text(head + begin + table + "\n" + end + tail)
+    files.write(_README, head + begin + table + "\n" + end + tail)

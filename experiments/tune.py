@@ -45,11 +45,11 @@ def main(config: TuneConfig) -> dict[str, Any]:
         source = _source(config, losses)
         objective = tuning.Objective(source.config, weights)
         tuned = tuned_parameters(config)
-        CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds", highlight=False)
+        CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds")
         found = _fit(config, objective, source, tuned, out)
         descent = {"source": source.name, "losses": dict(weights), **_descent(config, losses, found)}
         write_report(out, descent)
-        CONSOLE.print("judging what was held out, before and after; standard errors", highlight=False)
+        CONSOLE.print("judging what was held out, before and after; standard errors")
         sure = tuning.certainty(objective, found.params, source.compared, tuned)
         report = {
             **descent,
@@ -101,7 +101,7 @@ def _fit(config: Any, objective: tuning.Objective, source: Source, tuned: tuple[
 @contextmanager
 def _bar(epochs: int, tuned: tuple[str, ...], out: Path) -> Iterator[Callable[[tuning.Fit], None]]:
     """A bar with the loss and the parameters; the best so far is on disk after every epoch."""
-    columns = (TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=CONSOLE, transient=True) as bar:
         task = bar.add_task("tuning", total=epochs)
 
@@ -236,13 +236,12 @@ def _print(report: dict[str, Any]) -> None:
             for which in ("train", "validation")
             if rows[f"{which}_before"] is not None
         ]
-        CONSOLE.print(f"loss {name}, {_LOSS_WORDS[name]}: {'; '.join(pairs)}", highlight=False)
+        CONSOLE.print(f"loss {name}, {_LOSS_WORDS[name]}: {'; '.join(pairs)}")
     for sentence in report["not_identified"]:
-        CONSOLE.print(f"careful: {sentence}", highlight=False)
+        CONSOLE.print(f"careful: {sentence}")
     CONSOLE.print(
         f"{report['evaluations']} evaluations in {report['run_s']:.1f} s after {report['compile_s']:.1f} s of "
         f"compilation; {report['skipped_steps']} steps skipped as not finite",
-        highlight=False,
     )
 
 

@@ -32,7 +32,7 @@ _PARAM = re.compile(
 
 class _Scan(NamedTuple):
     fan: Fan
-    ranges: list[float]
+    ranges: np.ndarray
     pose: list[float] | None  # the scanner's x, y, theta; None: to be had from odometry
     stamp: float
     line: int
@@ -185,7 +185,7 @@ def _scan(kind: str, fields: list[str], number: int, where: str) -> _Scan:
         )
     return _Scan(
         fan=_stated_fan(fields, beams, where) if head else Fan(beams),
-        ranges=numbers(fields[begin:end], [f"range {k + 1}" for k in range(beams)], where, finite=False),
+        ranges=np.array(numbers(fields[begin:end], [f"range {k + 1}" for k in range(beams)], where, finite=False)),
         pose=numbers(fields[rest : rest + 3], middle[:3], where) if middle else None,
         stamp=numbers(fields[-1:], ("time",), where)[0],
         line=number,

@@ -219,7 +219,7 @@ def _parsed(
     for number, line in rows:
         where = f"{path}:{number}"
         fields = [field.strip() for field in line.split(separator)]
-        values.append(numbers(fields, names, where, finite=False))
+        values.append(np.array(numbers(fields, names, where, finite=False)))
         stamp = values[-1][names.index("t")]
         if not np.isfinite(stamp):
             raise ValueError(f"{where}: t: expected a finite stamp, got {stamp}")
