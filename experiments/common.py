@@ -61,9 +61,7 @@ def command_line(main: Callable[[Any], Any], config: type) -> None:
     except (ValueError, TypeError, OverflowError, OSError) as error:
         _leave(1, f"error: {error}")
     except KeyboardInterrupt as stop:
-        kept = "".join(map(str, stop.args))
-        again = shlex.join([*sys.orig_argv, *([] if "--resume" in sys.argv else ["--resume"])])
-        _leave(130, f"stopped; {kept}; go on with\n{again}" if kept else "stopped")
+        _leave(130, "; ".join(["stopped", *map(str, stop.args)]))
 
 
 def _leave(status: int, last_words: str) -> NoReturn:
@@ -114,8 +112,11 @@ def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeCo
                 one_run, key, runs, *args, chunk=config.chunk, devices=devices, progress=progress, parts=parts
             )
     except KeyboardInterrupt:
-        kept = [f"{parts.runs_kept:,} of {runs:,} runs are kept in {parts.folder}"] if parts.runs_kept else []
-        raise KeyboardInterrupt(*kept) from None
+        if not parts.runs_kept:
+            raise
+        again = shlex.join([*sys.orig_argv, *([] if "--resume" in sys.argv else ["--resume"])])
+        kept = f"{parts.runs_kept:,} of {runs:,} runs are kept in {parts.folder}"
+        raise KeyboardInterrupt(f"{kept}; go on with\n{again}") from None
 
 
 def how_computed(result: Result, runs: int, began: float, per_run: int = 1) -> dict[str, Any]:
