@@ -201,8 +201,8 @@ def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str,
         report["verdict"] = "no verdict: the log has no truth to judge the covariance by"
     elif 2 * flagged > len(info.ok):
         report["verdict"] = (
-            f"no verdict: {flagged} of {len(info.ok)} steps are flagged: their input, or what the filter made of it, is "
-            f"no number that can be used"
+            f"no verdict: {flagged} of {len(info.ok)} steps are flagged: their input, or what the filter made of it, "
+            f"is no number that can be used"
         )
     return report | {
         "log": log.name,

@@ -67,7 +67,7 @@ def most_bytes() -> int:
         ValueError: the environment says something that is no number of bytes.
     """
     said = os.environ.get(_LIMIT, str(_MOST_BYTES))
-    if not (said.isascii() and said.isdecimal() and 0 < int(said[:20])):
+    if not (said.isascii() and said.isdecimal() and int(said[:20]) > 0):
         raise ValueError(f"{_LIMIT}: expected a number of bytes > 0, got {said[:40]!r}")
     return int(said[:20])
 
@@ -128,7 +128,15 @@ def reading(path: str | Path, what: str) -> Iterator[None]:
         if str(error).startswith(str(path)) or isinstance(error, OSError):
             raise
         raise ValueError(f"{path}: expected {what}: {_first_line(error)}") from None
-    except (ArithmeticError, AssertionError, AttributeError, LookupError, MemoryError, RecursionError, TypeError) as error:
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        MemoryError,
+        RecursionError,
+        TypeError,
+    ) as error:
         raise ValueError(f"{path}: expected {what}, got one that cannot be read: {_first_line(error)}") from error
 
 

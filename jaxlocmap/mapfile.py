@@ -114,8 +114,8 @@ def load_map(path: str | Path) -> LoadedMap:
     - raw: x, rounded, or UNKNOWN if that is above 100.
 
     Raises:
-        ValueError: not such a YAML or picture, a missing or impossible field, a rotated map, aliases in the YAML, or more
-            than `files.most_bytes`; the message starts with the path.
+        ValueError: not such a YAML or picture, a missing or impossible field, a rotated map, aliases in the YAML, or
+            more than `files.most_bytes`; the message starts with the path.
         FileNotFoundError: no such file.
         ImportError: PyYAML is not installed.
     """

@@ -166,9 +166,7 @@ class Parts:
             foreign.append(manifest)
         if foreign:
             names = ", ".join(file.name for file in foreign[:3])
-            raise ValueError(
-                f"parts: expected a study's files in {self.folder}, got others: {names}; none was touched"
-            )
+            raise ValueError(f"parts: expected a study's files in {self.folder}, got others: {names}; none was touched")
         if (there or manifest.exists()) and not self.discard:
             what = "damaged" if manifest.exists() else "missing"
             raise ValueError(

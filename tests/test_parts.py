@@ -146,7 +146,7 @@ def test_nothing_to_resume_is_said(folder):
 
 DAMAGE = {
     "emptied": lambda text: "",
-    "cut": lambda text: text[:200],
+    "cut": lambda text: text[:-10],
     "list": lambda text: f'["jaxlocmap study", {text}]',
     "chunk": lambda text: text.replace('"chunk": 4', '"chunk": 200'),
     "true": lambda text: text.replace('"chunk": 4', '"chunk": true'),
@@ -171,9 +171,9 @@ def test_with_a_damaged_manifest_nothing_is_believed_and_nothing_lost(folder, ho
     damage(folder, how)
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert at(folder, resume=True).recorded_chunk() is None
-    word = "missing" if how == "missing" else "damaged"
+    told = rf"got 2 finished parts whose manifest.json is {'missing' if how == 'missing' else 'damaged'}; discard"
     for flags in ({"resume": True}, {"discard": False}):
-        with pytest.raises(ValueError, match=f"got 2 finished parts whose manifest.json is {word}; discard starts anew"):
+        with pytest.raises(ValueError, match=told):
             opened(folder, **flags)
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
     _, finished, said = opened(folder, discard=True)
@@ -222,11 +222,11 @@ def test_links_in_the_folder_lead_nowhere(folder, tmp_path):
     assert not (folder / "part-001").is_symlink()
     (folder / "manifest.json").unlink()
     (folder / "manifest.json").symlink_to(outside)
-    with pytest.raises(ValueError, match="got others: manifest.json; none was touched"):
+    with pytest.raises(ValueError, match=r"got others: manifest\.json; none was touched"):
         opened(folder, discard=True)
     (folder / "manifest.json").unlink()
     (folder / ".lock-0").symlink_to(outside)
-    with pytest.raises(OSError, match=".lock-0"):
+    with pytest.raises(OSError, match=r"\.lock-0"):
         opened(folder, discard=True)
     assert outside.read_text() == "mine"
 
