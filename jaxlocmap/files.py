@@ -128,15 +128,7 @@ def reading(path: str | Path, what: str) -> Iterator[None]:
         if str(error).startswith(str(path)) or isinstance(error, OSError):
             raise
         raise ValueError(f"{path}: expected {what}: {_first_line(error)}") from None
-    except (
-        ArithmeticError,
-        AssertionError,
-        AttributeError,
-        LookupError,
-        MemoryError,
-        RecursionError,
-        TypeError,
-    ) as error:
+    except (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError) as error:
         raise ValueError(f"{path}: expected {what}, got one that cannot be read: {_first_line(error)}") from error
 
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxlocmap import files
 from jaxlocmap.logs.fan import Fan, check_fov, directions, fits
 from jaxlocmap.logs.record import Log
 from jaxlocmap.logs.text import lines, numbers, whole
@@ -91,6 +92,13 @@ def read_carmen(
     data set repository (D. Haehnel, for Intel).
     """
     _check_arguments(fov, max_range, laser_offset)
+    with files.reading(path, "a CARMEN log"):
+        return _read(path, fov, max_range, laser_offset)
+
+
+def _read(
+    path: str | Path, fov: float | None, max_range: float | None, laser_offset: Sequence[float] | None
+) -> Log:
     posed, raw, odometry = [], [], []
     params, unknown, short = {}, 0, None
     kind, fields, where = "", [], ""
