@@ -9,6 +9,7 @@ import os
 import shlex
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -91,7 +92,7 @@ def start(config: ComputeConfig) -> None:
 def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -> Parts:
     """Where in the output folder a study with these settings keeps its finished parts."""
     return Parts(
-        out / "parts",
+        out,
         settings,
         resume=config.resume,
         discard=config.discard,
@@ -171,9 +172,7 @@ def output_folder(path: Path) -> Path:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".writable-{os.getpid()}"  # several processes may share the folder
-        probe.write_text("")
-        probe.unlink()
+        tempfile.TemporaryFile(dir=path).close()  # under a name that nobody else has
     except OSError as error:
         raise OSError(f"out: expected a folder that can be written, got {path}: {error.strerror}") from None
     return path

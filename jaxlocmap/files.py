@@ -119,7 +119,8 @@ def reading(path: str | Path, what: str) -> Iterator[None]:
     """Whatever goes wrong with the content of a file leaves as a ValueError that starts with its path.
 
     Args:
-        path: of the file; errors that name it already, or another file below it, pass as they are.
+        path: of the file. Of a ValueError it is put before the words, unless they start with it, or with that of a file
+            below it. Others, such as a stack that is too deep, say what was expected.
         what: is expected of it, for the message.
     """
     try:
@@ -127,10 +128,6 @@ def reading(path: str | Path, what: str) -> Iterator[None]:
     except (OSError, ValueError) as error:
         if str(error).startswith(str(path)) or isinstance(error, OSError):
             raise
-        raise ValueError(f"{path}: expected {what}: {_first_line(error)}") from None
+        raise ValueError(f"{path}: {str(error)[:500]}") from None
     except (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError) as error:
-        raise ValueError(f"{path}: expected {what}, got one that cannot be read: {_first_line(error)}") from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise ValueError(f"{path}: expected {what}, got one that cannot be read: {type(error).__name__}") from error

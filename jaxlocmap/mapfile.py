@@ -71,7 +71,7 @@ def save_map(
         ValueError: a name that is none, log-odds of another shape than the grid, or thresholds that `trinary` refuses.
         OSError: the files cannot be written.
     """
-    if name in ("", ".", "..") or any(c in name for c in "/\\\0"):
+    if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
         raise ValueError(f"name: expected the name of a file, without folder and suffix, got {name!r}")
     checks.shape("log_odds", log_odds, spec.shape)
     cells = trinary(np.asarray(log_odds), occupied_above=occupied_above, free_below=free_below)
@@ -131,9 +131,10 @@ def load_map(path: str | Path) -> LoadedMap:
             return super().compose_node(parent, index)
 
     with files.reading(path, "a map_server YAML"):
+        text = files.read(path)
         try:
-            sheet = yaml.load(files.read(path), Loader)
-        except yaml.YAMLError as error:
+            sheet = yaml.load(text, Loader)
+        except (yaml.YAMLError, ValueError) as error:
             raise ValueError(f"{path}: expected a map_server YAML: {error}") from None
         sheet = _Sheet.of(sheet)
     picture = Path(path).parent / sheet.image
@@ -159,22 +160,22 @@ class _Sheet(NamedTuple):
         needed = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
         missing = [field for field in needed if not isinstance(fields, dict) or fields.get(field) is None]
         if missing:
-            raise ValueError(f"the fields {', '.join(needed)}, missing {', '.join(missing)}")
+            raise ValueError(f"expected the fields {', '.join(needed)}, missing {', '.join(missing)}")
         image, mode, origin, negate = (fields.get(name, "trinary") for name in ("image", "mode", "origin", "negate"))
         if not isinstance(image, str) or not image or "\0" in image:
             raise ValueError(f"image: expected the name of a file, got {_shown(image)}")
         if not isinstance(mode, str) or mode.lower() not in ("trinary", "scale", "raw"):
             raise ValueError(f"mode: expected trinary, scale or raw, got {_shown(mode)}")
         if not isinstance(origin, list) or len(origin) != 3:
-            raise ValueError(f"origin: expected x, y and yaw, got {_shown(origin)}")
+            raise ValueError(f"origin: expected three numbers, got {_shown(origin)}")
         x, y, yaw = (_number("origin", value) for value in origin)
         if yaw != 0:
-            raise ValueError(f"origin: expected one without rotation, got {yaw} rad")
+            raise ValueError(f"expected an origin without rotation, got {yaw} rad")
         if negate not in (0, 1):
             raise ValueError(f"negate: expected 0 or 1, got {_shown(negate)}")
         resolution, high, low = (_number(name, fields[name]) for name in ("resolution", *needed[4:]))
         if not 0 <= low <= high <= 1:
-            raise ValueError(f"free_thresh, occupied_thresh: expected 0 <= free <= occupied <= 1, got {low}, {high}")
+            raise ValueError(f"expected 0 <= free_thresh <= occupied_thresh <= 1, got {low}, {high}")
         return cls(image, mode.lower(), resolution, (x, y), bool(negate), high, low)
 
 
@@ -235,7 +236,9 @@ def _read_picture(path: Path, sheet: _Sheet) -> np.ndarray:
                 raise ValueError(f"{path}: expected pixels of 8 or 16 bits, got Pillow's mode {image.mode}")
     except UnidentifiedImageError:
         raise ValueError(f"{path}: expected a picture such as PGM or PNG, got something else") from None
-    except (OSError, SyntaxError, Image.DecompressionBombError):  # their words may quote the file
+    except Image.DecompressionBombError as error:
+        raise ValueError(f"{path}: expected a whole picture that Pillow reads: {error}") from None
+    except (OSError, SyntaxError):  # their words may quote the file
         raise ValueError(f"{path}: expected a whole picture that Pillow reads, got a damaged one") from None
     except ValueError as error:
         if str(error).startswith(str(path)):

@@ -84,7 +84,10 @@ class Params(NamedTuple):
                 the message starts with the path.
         """
         with files.reading(path, f"a JSON object with {cls._fields}"):
-            fields = json.loads(files.read(path))
+            try:
+                fields = json.loads(files.read(path))
+            except (json.JSONDecodeError, UnicodeDecodeError) as error:
+                raise ValueError(f"expected a JSON object with {cls._fields}: {error}") from None
         if not isinstance(fields, dict) or set(fields) != set(cls._fields):
             got = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
             raise ValueError(f"{path}: expected exactly the fields {cls._fields}, got {got}")

@@ -96,9 +96,7 @@ def read_carmen(
         return _read(path, fov, max_range, laser_offset)
 
 
-def _read(
-    path: str | Path, fov: float | None, max_range: float | None, laser_offset: Sequence[float] | None
-) -> Log:
+def _read(path: str | Path, fov: float | None, max_range: float | None, laser_offset: Sequence[float] | None) -> Log:
     posed, raw, odometry = [], [], []
     params, unknown, short = {}, 0, None
     kind, fields, where = "", [], ""

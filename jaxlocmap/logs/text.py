@@ -11,6 +11,8 @@ import numpy as np
 
 from jaxlocmap import files
 
+# m, s or rad: nothing that a robot measures is larger, and the squares of what is are of no use.
+LARGEST = 1e12
 _LONGEST_LINE = 2**20  # bytes: a scan of 100,000 beams
 
 
@@ -57,8 +59,8 @@ def numbers(fields: Sequence[str], names: Sequence[str], where: str, *, finite: 
     """Parse as many fields as names.
 
     Raises:
-        ValueError: another number of fields, or one that is no number or (with `finite`) not finite; the
-            message starts with `where` and gives the column's name.
+        ValueError: another number of fields, or one that is no number or (with `finite`) not finite or larger
+            than 1e12 in size; the message starts with `where` and gives the column's name.
     """
     if len(fields) != len(names):
         listed = ", ".join(names if len(names) <= 10 else [*names[:3], "...", names[-1]])
@@ -73,6 +75,9 @@ def _number(name: str, field: str, where: str, finite: bool) -> float:
         value = None
     if value is None or (finite and not math.isfinite(value)):
         kind = "a finite number" if finite else "a number"
+        raise ValueError(f"{where}: {name}: expected {kind}, got {field[:40]!r}")
+    if finite and abs(value) > LARGEST:
+        kind = f"a number of a size up to {LARGEST:g}"
         raise ValueError(f"{where}: {name}: expected {kind}, got {field[:40]!r}")
     return value
 
