@@ -27,7 +27,7 @@ from baselines import course, cpp, peers, tables
 from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
 
 import jaxlocmap
-from jaxlocmap import hosts, simulate
+from jaxlocmap import files, hosts, simulate
 from jaxlocmap.hosts import check_count, merge_kernels, use_all_cores
 from jaxlocmap.monte_carlo import Result, monte_carlo
 from jaxlocmap.study import Study, summarise
@@ -113,12 +113,12 @@ def main(config: BenchmarkConfig) -> dict[str, Any]:
     shown = [table for table in (tables.overview(report), tables.filters(report)) if table.rows]
     notes = tables.notes(report)
     text = "\n".join([*(table.markdown() for table in shown), *notes])
-    (out / "tables.md").write_text(f"{text}\n")
+    files.write(out / "tables.md", f"{text}\n")
     if config.write:
         replace_table("benchmark", text)
     for table in shown:
         CONSOLE.print(table.rich())
-    CONSOLE.print(*notes, sep="\n", highlight=False)
+    CONSOLE.print(*notes, sep="\n")
     saved(out, "report.json", "tables.md")
     return report
 

@@ -124,7 +124,7 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
             ("map entropy", f"{report['map_entropy_bits']:.1f} bits", ""),
         ],
     )
-    CONSOLE.print("one run; for whether the covariance can be believed, run consistency.py", highlight=False)
+    CONSOLE.print("one run; for whether the covariance can be believed, run consistency.py")
     saved(out, "report.json", "trajectory.png", "map.png")
     return report
 

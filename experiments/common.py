@@ -9,6 +9,7 @@ import os
 import shlex
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -23,12 +24,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxlocmap import Params, hosts, simulate
+from jaxlocmap import Params, files, hosts, simulate
 from jaxlocmap.monte_carlo import Result, monte_carlo
 from jaxlocmap.parts import Parts
 
 _README = Path(__file__).parent.parent / "README.md"
-CONSOLE = Console(width=min(100, Console().width) if sys.stdout.isatty() else 100)
+# A path or a name may hold what looks like markup.
+CONSOLE = Console(width=min(100, Console().width) if sys.stdout.isatty() else 100, markup=False, highlight=False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,9 +62,7 @@ def command_line(main: Callable[[Any], Any], config: type) -> None:
     except (ValueError, TypeError, OverflowError, OSError) as error:
         _leave(1, f"error: {error}")
     except KeyboardInterrupt as stop:
-        kept = "".join(map(str, stop.args))
-        again = shlex.join([*sys.orig_argv, *([] if "--resume" in sys.argv else ["--resume"])])
-        _leave(130, f"stopped; {kept}; go on with\n{again}" if kept else "stopped")
+        _leave(130, "; ".join(["stopped", *map(str, stop.args)]))
 
 
 def _leave(status: int, last_words: str) -> NoReturn:
@@ -92,11 +92,11 @@ def start(config: ComputeConfig) -> None:
 def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -> Parts:
     """Where in the output folder a study with these settings keeps its finished parts."""
     return Parts(
-        out / "parts",
+        out,
         settings,
         resume=config.resume,
         discard=config.discard,
-        say=lambda sentence: CONSOLE.print(sentence, highlight=False, soft_wrap=True),
+        say=lambda sentence: CONSOLE.print(sentence, soft_wrap=True),
     )
 
 
@@ -113,8 +113,11 @@ def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeCo
                 one_run, key, runs, *args, chunk=config.chunk, devices=devices, progress=progress, parts=parts
             )
     except KeyboardInterrupt:
-        kept = [f"{parts.runs_kept:,} of {runs:,} runs are kept in {parts.folder}"] if parts.runs_kept else []
-        raise KeyboardInterrupt(*kept) from None
+        if not parts.runs_kept:
+            raise
+        again = shlex.join([*sys.orig_argv, *([] if "--resume" in sys.argv else ["--resume"])])
+        kept = f"{parts.runs_kept:,} of {runs:,} runs are kept in {parts.folder}"
+        raise KeyboardInterrupt(f"{kept}; go on with\n{again}") from None
 
 
 def how_computed(result: Result, runs: int, began: float, per_run: int = 1) -> dict[str, Any]:
@@ -169,9 +172,7 @@ def output_folder(path: Path) -> Path:
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".writable-{os.getpid()}"  # several processes may share the folder
-        probe.write_text("")
-        probe.unlink()
+        tempfile.TemporaryFile(dir=path).close()  # under a name that nobody else has
     except OSError as error:
         raise OSError(f"out: expected a folder that can be written, got {path}: {error.strerror}") from None
     return path
@@ -206,7 +207,7 @@ def params_or(path: Path | None, default: Params) -> Params:
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar that is moved by calling with the number done so far."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=CONSOLE, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda done: bar.update(task, completed=done)
@@ -214,7 +215,7 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:
     """`report.json`; a number that is not finite becomes null, which is what JSON has for it."""
-    (folder / "report.json").write_text(json.dumps(_plain(report), indent=1, allow_nan=False) + "\n")
+    files.write(folder / "report.json", json.dumps(_plain(report), indent=1, allow_nan=False) + "\n")
 
 
 def _plain(value: Any) -> Any:
@@ -258,4 +259,4 @@ def replace_table(name: str, table: str) -> None:
     _, ended, tail = rest.partition(end)
     if not (found and ended):
         raise ValueError(f"{_README}: expected the marks {begin.strip()} and {end}")
-    _README.write_text(head + begin + table + "\n" + end + tail)
+    files.write(_README, head + begin + table + "\n" + end + tail)

@@ -184,7 +184,6 @@ def _print(report: dict[str, Any]) -> None:
     CONSOLE.print(
         f"{report['runs_per_s']:.0f} runs/s after {report['compile_s']:.1f} s of compilation, in chunks of "
         f"{report['chunk']} runs on {report['devices']} device(s) of {report['processes']} process(es)",
-        highlight=False,
     )
 
 

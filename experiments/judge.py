@@ -129,7 +129,6 @@ def _print(report: dict[str, Any], title: str) -> None:
         CONSOLE.print(
             f"{span['side']} from {span['from_s']:.4g} to {span['to_s']:.4g} s (x {x0:.3g} to {x1:.3g} m, "
             f"y {y0:.3g} to {y1:.3g} m): NEES {readable(span['anees'])}",
-            highlight=False,
         )
     print_verdicts(report)
 

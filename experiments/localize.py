@@ -97,7 +97,7 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
         prior = prior_at(start)
         CONSOLE.print(f"{len(timeline.time)} steps of {log.name}; compiling takes some seconds")
         for sentence in (said := time_sentences(log, timeline.counts, config.max_gap)):
-            CONSOLE.print(f"careful: {sentence}", highlight=False)
+            CONSOLE.print(f"careful: {sentence}")
         info = filter_log(params, prior, timeline.inputs, log.landmarks, settings)
         report = judge(log, timeline, info, settings)
     report["careful"] = said
@@ -196,12 +196,18 @@ def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str,
     )
     nees = np.array(report["nees_per_step"])
     at_sightings = nees[valid.any(axis=1) & np.isfinite(nees)]
+    flagged = int((~info.ok).sum())
     if not truth.any():
         report["verdict"] = "no verdict: the log has no truth to judge the covariance by"
+    elif 2 * flagged > len(info.ok):
+        report["verdict"] = (
+            f"no verdict: {flagged} of {len(info.ok)} steps are flagged: their input, or what the filter made of it, "
+            f"is no number that can be used"
+        )
     return report | {
         "log": log.name,
         "duration_s": float(timeline.time[-1] - timeline.time[0]),
-        "flagged_steps": int((~info.ok).sum()),
+        "flagged_steps": flagged,
         "log_likelihood": float(info.log_likelihood.sum()),
         "counts": timeline.counts,
         "left_out": report["counts"],
@@ -233,7 +239,11 @@ def _write(out: Path, log: Log, timeline: Timeline, info: Info, report: dict[str
 
 
 def _print(report: dict[str, Any], judged: bool) -> None:
-    rows = [("steps, observations", f"{report['steps']}, {report['observations']}", ""), *innovation_rows(report)]
+    rows = [
+        ("steps, observations", f"{report['steps']}, {report['observations']}", ""),
+        ("flagged steps", str(report["flagged_steps"]), "0"),
+        *innovation_rows(report),
+    ]
     if judged:
         rows += [
             ("steps with truth", f"{100 * report['truth_share']:.1f} %", ""),

@@ -68,7 +68,6 @@ def main(config: MapLogConfig) -> dict[str, Any]:
     mapped, spec, settings = ready(log, config.resolution, config.max_range)
     CONSOLE.print(
         f"{len(log.scan)} scans of {log.scan.shape[1]} beams onto {spec.shape[0]} x {spec.shape[1]} cells",
-        highlight=False,
     )
     say_doubts(log, settings.max_range)
     log_odds, seconds, compile_s = _map(params, mapped, settings)
@@ -141,11 +140,11 @@ def say_doubts(log: Log, max_range: float) -> None:
     if log.beam_angles_from == "assumed":
         first, last = np.rad2deg(log.beam_angles[[0, -1]])
         say = f"the log does not say where its beams point: assumed {first:g} to {last:g} degrees"
-        CONSOLE.print(say, highlight=False, soft_wrap=True)
+        CONSOLE.print(say, soft_wrap=True)
     below, measured = int(np.sum(log.scan < max_range)), int(np.sum(~np.isnan(log.scan)))
     if below < _FEW * measured:
         say = f"only {below} of {measured} ranges lie below the limit of {max_range:g} m: is the unit metres?"
-        CONSOLE.print(say, highlight=False, soft_wrap=True)
+        CONSOLE.print(say, soft_wrap=True)
 
 
 def ready(log: Log, resolution: float, max_range: float) -> tuple[Log, GridSpec, Config]:

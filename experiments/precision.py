@@ -209,7 +209,7 @@ def main(config: PrecisionConfig) -> dict[str, Any]:
     if sharp:
         _print(f"The same over {steps[0]} steps with a sharper landmark detector", sharp)
     for row in rows:
-        CONSOLE.print(row["verdict"], highlight=False)
+        CONSOLE.print(row["verdict"])
     saved(out, "report.json", "precision.png")
     return report
 

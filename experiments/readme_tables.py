@@ -64,7 +64,7 @@ def main(config: TablesConfig) -> dict[str, str]:
         if config.write:
             replace_table(name, table)
         else:
-            CONSOLE.print(f"\n{table}", markup=False, highlight=False, soft_wrap=True)
+            CONSOLE.print(f"\n{table}", soft_wrap=True)
     return tables
 
 

@@ -68,6 +68,6 @@ def innovation_rows(report: dict[str, Any]) -> Rows:
 
 def print_verdicts(report: dict[str, Any]) -> None:
     """What the report says of the covariance, and of the gate if it knows of one."""
-    CONSOLE.print(f"[bold]{report['verdict']}[/bold]", highlight=False)
+    CONSOLE.print(report["verdict"], style="bold")
     if "gate_verdict" in report:
-        CONSOLE.print(report["gate_verdict"], highlight=False)
+        CONSOLE.print(report["gate_verdict"])

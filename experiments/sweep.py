@@ -336,10 +336,10 @@ def _print(report: dict[str, Any]) -> None:
         CONSOLE.print(table)
     if "what_the_gate_buys" in report:
         _print_gate(y if x == "gate_probability" else x, report["what_the_gate_buys"])
-        CONSOLE.print(f"[bold]{report['gate_verdict']}[/bold]", highlight=False)
-    CONSOLE.print(f"[bold]{report['verdict']}[/bold]", highlight=False)
+        CONSOLE.print(report["gate_verdict"], style="bold")
+    CONSOLE.print(report["verdict"], style="bold")
     speed = f"{report['runs_per_s']:.0f} runs/s, every cell's counted, after {report['compile_s']:.1f} s of compilation"
-    CONSOLE.print(speed, highlight=False)
+    CONSOLE.print(speed)
 
 
 def _print_gate(other: str, rows: list[dict[str, Any]]) -> None:

@@ -33,10 +33,23 @@ _LOSS_WORDS = {
 
 
 def main(config: TuneConfig) -> dict[str, Any]:
-    """Tune, judge before and after, write the parameters, the report and the figures."""
-    began = time.perf_counter()
+    """Tune, judge before and after, write the parameters, the report and the figures.
+
+    Raises:
+        KeyboardInterrupt: it was stopped; says what is kept, if anything.
+    """
     config = checked(config)
     out = output_folder(config.out)
+    kept: list[str] = []
+    try:
+        return hosts.waiting(lambda: _tune(config, out, kept))  # so that Ctrl-C is heard while JAX compiles
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(*kept[-1:]) from None
+
+
+def _tune(config: TuneConfig, out: Path, kept: list[str]) -> dict[str, Any]:
+    """As `main`; says in `kept` what is on disk."""
+    began = time.perf_counter()
     weights = loss_weights(config)
     losses = tuple(name for name, _ in weights)
     hosts.use_all_cores()
@@ -45,11 +58,12 @@ def main(config: TuneConfig) -> dict[str, Any]:
         source = _source(config, losses)
         objective = tuning.Objective(source.config, weights)
         tuned = tuned_parameters(config)
-        CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds", highlight=False)
-        found = _fit(config, objective, source, tuned, out)
+        CONSOLE.print(f"tuning {', '.join(tuned)} on {source.name}; compiling takes some seconds")
+        found = _fit(config, objective, source, tuned, out, kept)
         descent = {"source": source.name, "losses": dict(weights), **_descent(config, losses, found)}
         write_report(out, descent)
-        CONSOLE.print("judging what was held out, before and after; standard errors", highlight=False)
+        kept.append(f"{kept[-1]}, and the descent in {out / 'report.json'}")
+        CONSOLE.print("judging what was held out, before and after; standard errors")
         sure = tuning.certainty(objective, found.params, source.compared, tuned)
         report = {
             **descent,
@@ -81,8 +95,10 @@ def _source(config: Any, losses: tuple[str, ...]) -> Source:
     return from_robots(config.log, kind, robots, config.judged, config.motion, config.max_range, wanted)
 
 
-def _fit(config: Any, objective: tuning.Objective, source: Source, tuned: tuple[str, ...], out: Path) -> tuning.Fit:
-    with _bar(config.epochs, tuned, out) as progress:
+def _fit(
+    config: Any, objective: tuning.Objective, source: Source, tuned: tuple[str, ...], out: Path, kept: list[str]
+) -> tuning.Fit:
+    with _bar(config.epochs, tuned, out, kept) as progress:
         return tuning.fit(
             objective,
             source.start,
@@ -99,17 +115,19 @@ def _fit(config: Any, objective: tuning.Objective, source: Source, tuned: tuple[
 
 
 @contextmanager
-def _bar(epochs: int, tuned: tuple[str, ...], out: Path) -> Iterator[Callable[[tuning.Fit], None]]:
+def _bar(epochs: int, tuned: tuple[str, ...], out: Path, kept: list[str]) -> Iterator[Callable[[tuning.Fit], None]]:
     """A bar with the loss and the parameters; the best so far is on disk after every epoch."""
-    columns = (TextColumn("{task.description}"), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=CONSOLE, transient=True) as bar:
         task = bar.add_task("tuning", total=epochs)
 
         def move(fit: tuning.Fit) -> None:
             fit.params.save(out / "params.json")
+            done = len(fit.losses) - 1
+            kept.append(f"the best of {done} epochs is kept in {out / 'params.json'}, from which --params goes on")
             best = tuning.natural(fit.params)
             values = ", ".join(f"{name} {float(best[name]):.4g}" for name in tuned)
-            bar.update(task, completed=len(fit.losses) - 1, description=f"loss {fit.loss:.5g}: {values}")
+            bar.update(task, completed=done, description=f"loss {fit.loss:.5g}: {values}")
 
         yield move
 
@@ -236,13 +254,12 @@ def _print(report: dict[str, Any]) -> None:
             for which in ("train", "validation")
             if rows[f"{which}_before"] is not None
         ]
-        CONSOLE.print(f"loss {name}, {_LOSS_WORDS[name]}: {'; '.join(pairs)}", highlight=False)
+        CONSOLE.print(f"loss {name}, {_LOSS_WORDS[name]}: {'; '.join(pairs)}")
     for sentence in report["not_identified"]:
-        CONSOLE.print(f"careful: {sentence}", highlight=False)
+        CONSOLE.print(f"careful: {sentence}")
     CONSOLE.print(
         f"{report['evaluations']} evaluations in {report['run_s']:.1f} s after {report['compile_s']:.1f} s of "
         f"compilation; {report['skipped_steps']} steps skipped as not finite",
-        highlight=False,
     )
 
 

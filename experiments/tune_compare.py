@@ -90,7 +90,7 @@ def main(config: CompareConfig) -> dict[str, Any]:
     for name, table in tables.items():
         if config.write:
             replace_table(name, table)
-        CONSOLE.print(f"\n{table}", markup=False, highlight=False, soft_wrap=True)
+        CONSOLE.print(f"\n{table}", soft_wrap=True)
     write_report(out, report)
     saved(out, "report.json")
     return report
@@ -284,7 +284,7 @@ def _linear(config: CompareConfig) -> list[dict[str, Any]]:
         fit = tuning.fit(objective, start, train, tuned=tuning.FULL_NOISE, epochs=2 if config.quick else 20)
         rows.append(_linear_row(f"this library, `{loss}`", fit.params, fit.run_s, test, settings))
     if importlib.util.find_spec("okf") is None:
-        CONSOLE.print("OKF is not installed (the extra `okf`): its row is left out", highlight=False)
+        CONSOLE.print("OKF is not installed (the extra `okf`): its row is left out")
     else:
         params, seconds = _okf(train, config)
         rows.append(_linear_row("OKF, squared error", params, seconds, test, settings))

@@ -62,7 +62,7 @@ def main(config: RobotsConfig) -> dict[str, Any]:
     table = _table([row for row in rows if not row["one_of_many"]])
     if config.write:
         replace_table("robots", table)
-    CONSOLE.print(f"\n{table}", markup=False, highlight=False, soft_wrap=True)
+    CONSOLE.print(f"\n{table}", soft_wrap=True)
     report = {"rows": rows}
     write_report(out, report)
     saved(out, "report.json")

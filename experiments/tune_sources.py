@@ -197,7 +197,7 @@ def _timeline(
         raise ValueError(f"{path}: expected a log with truth, to start from, to judge by and for some losses, got none")
     timeline = to_timeline(log, max_range=max_range, start=float(log.truth_time.min()), max_gap=wanted.max_gap)
     for sentence in time_sentences(log, timeline.counts, wanted.max_gap):
-        CONSOLE.print(f"careful: {log.name}: {sentence}", highlight=False)
+        CONSOLE.print(f"careful: {log.name}: {sentence}")
     return log, _cut(timeline, 0, 6000 if kind == "mrclam" else 2400) if wanted.quick else timeline
 
 

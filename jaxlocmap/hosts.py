@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import ipaddress
 import numbers
 import os
 import socket
@@ -101,7 +103,9 @@ def join(
     gracefully. Once joined, a process stays so: another call does nothing.
 
     Args:
-        coordinator: "host:port" of process 0, which listens there.
+        coordinator: "host:port" of process 0. It listens at that address alone if it is given as a number
+            (127.0.0.1:1234), at all addresses of its machine if by name. There is no password: whoever reaches the
+            port can join, so let that be in a network of your own.
         processes: how many there are. process_id: which one this is, from 0.
         timeout: s, how long the processes wait for each other.
 
@@ -120,11 +124,16 @@ def join(
     if process_id is not None:
         check_count("process_id", process_id, 0, None if processes is None else processes - 1)
 
-    if coordinator is not None and process_id == 0:
-        _check_free(int(port))
+    bind = _listening_at(host, int(port)) if coordinator is not None and process_id == 0 else None
 
     def initialize() -> None:
-        jax.distributed.initialize(coordinator, processes, process_id, initialization_timeout=_JAX_NEVER)
+        jax.distributed.initialize(
+            coordinator,
+            processes,
+            process_id,
+            initialization_timeout=_JAX_NEVER,
+            coordinator_bind_address=bind,
+        )
 
     try:
         waiting(initialize, timeout)
@@ -142,12 +151,26 @@ def join(
         raise ConnectionError(f"distributed: JAX cannot meet the other processes: {error}") from None
 
 
-def _check_free(port: int) -> None:
+def _listening_at(host: str, port: int) -> str | None:
+    """Where process 0 is to listen: at the address it was given, if that is a number of this machine's; else, as a name
+    may mean another address to others, at all of them (None).
+    """
     try:  # JAX may crash where it cannot listen
-        address, family = ("::", socket.AF_INET6) if socket.has_dualstack_ipv6() else ("", socket.AF_INET)
-        socket.create_server((address, port), family=family, dualstack_ipv6=bool(address)).close()
+        try:
+            address = ipaddress.ip_address(host.strip("[]"))
+            family = socket.AF_INET if address.version == 4 else socket.AF_INET6
+            socket.create_server((str(address), port), family=family).close()
+            return f"{host}:{port}"
+        except ValueError:
+            pass
+        except OSError as error:
+            if error.errno != errno.EADDRNOTAVAIL:  # else behind a translated address, as in a container
+                raise
+        everywhere, family = ("::", socket.AF_INET6) if socket.has_dualstack_ipv6() else ("", socket.AF_INET)
+        socket.create_server((everywhere, port), family=family, dualstack_ipv6=bool(everywhere)).close()
     except OSError as error:
         raise ConnectionError(f"coordinator: expected a free port to listen at, got {port}: {error}") from None
+    return None
 
 
 def _who_is_missing(host: str, port: str, processes: int | None, timeout: float) -> str:

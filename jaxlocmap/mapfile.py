@@ -5,15 +5,16 @@ Source: "Value interpretation" in wiki.ros.org/map_server, and its loaders of RO
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxlocmap import checks
+from jaxlocmap import checks, files
 from jaxlocmap.types import GridSpec
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1  # as in nav_msgs/OccupancyGrid
@@ -59,8 +60,7 @@ def save_map(
     """Write `name.pgm` and `name.yaml` for ROS map_server.
 
     Args:
-        folder: to write into, made if missing. name: of the files without suffix; one with folders in it is taken from
-            `folder` on.
+        folder: to write into, made if missing. name: of the files, without folder and suffix.
         log_odds: (rows, columns) nats. spec: where the grid lies.
         occupied_above, free_below: probabilities, as in `trinary`; map_server's defaults.
 
@@ -71,24 +71,24 @@ def save_map(
         ValueError: a name that is none, log-odds of another shape than the grid, or thresholds that `trinary` refuses.
         OSError: the files cannot be written.
     """
-    if Path(name).name in ("", ".."):
-        raise ValueError(f"name: expected the name of a file without suffix, got {name!r}")
+    if name in ("", ".", "..") or Path(name).name != name or "\0" in name:
+        raise ValueError(f"name: expected the name of a file, without folder and suffix, got {name!r}")
     checks.shape("log_odds", log_odds, spec.shape)
     cells = trinary(np.asarray(log_odds), occupied_above=occupied_above, free_below=free_below)
     picture = np.full(cells.shape, _GREY[UNKNOWN], np.uint8)
     for kind in (OCCUPIED, FREE):
         picture[cells == kind] = _GREY[kind]
     rows, columns = cells.shape
-    path = Path(folder, name)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
     # A picture's first row is its top, a grid's first row its lowest y.
-    path.with_name(f"{path.name}.pgm").write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + picture[::-1].tobytes())
-    path.with_name(f"{path.name}.yaml").write_text(
-        f"image: {_scalar(path.name + '.pgm')}\nmode: trinary\nresolution: {float(spec.resolution)!r}\n"
+    files.write(path / f"{name}.pgm", f"P5\n{columns} {rows}\n255\n".encode() + picture[::-1].tobytes())
+    files.write(
+        path / f"{name}.yaml",
+        f"image: {_scalar(name + '.pgm')}\nmode: trinary\nresolution: {float(spec.resolution)!r}\n"
         f"origin: [{float(spec.origin[0])!r}, {float(spec.origin[1])!r}, 0.0]\nnegate: 0\n"
         # Of the picture's three greys, whatever the thresholds the cells were sorted by.
         "occupied_thresh: 0.65\nfree_thresh: 0.196\n",
-        encoding="utf-8",
     )
     return cells
 
@@ -114,8 +114,8 @@ def load_map(path: str | Path) -> LoadedMap:
     - raw: x, rounded, or UNKNOWN if that is above 100.
 
     Raises:
-        ValueError: not such a YAML or picture, a missing or impossible field, or a rotated map; the message starts with
-            the path.
+        ValueError: not such a YAML or picture, a missing or impossible field, a rotated map, aliases in the YAML, or
+            more than `files.most_bytes`; the message starts with the path.
         FileNotFoundError: no such file.
         ImportError: PyYAML is not installed.
     """
@@ -124,33 +124,75 @@ def load_map(path: str | Path) -> LoadedMap:
     except ImportError as error:
         raise ImportError("load_map needs PyYAML: pip install 'jaxlocmap[experiments]'") from error
 
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):  # a few hundred bytes of them can stand for gigabytes
+                raise yaml.YAMLError("expected no aliases, got one")
+            return super().compose_node(parent, index)
+
+    with files.reading(path, "a map_server YAML"):
+        text = files.read(path)
+        try:
+            sheet = yaml.load(text, Loader)
+        except (yaml.YAMLError, ValueError) as error:
+            raise ValueError(f"{path}: expected a map_server YAML: {error}") from None
+        sheet = _Sheet.of(sheet)
+    picture = Path(path).parent / sheet.image
+    with files.reading(picture, "a picture"):
+        cells = _read_picture(picture, sheet)[::-1]
+    with files.reading(path, "a grid"):
+        return LoadedMap(cells, GridSpec(origin=sheet.origin, resolution=sheet.resolution, shape=cells.shape))
+
+
+class _Sheet(NamedTuple):
+    """The fields of the YAML."""
+
+    image: str
+    mode: str
+    resolution: float
+    origin: tuple[float, float]
+    negate: bool
+    high: float
+    low: float
+
+    @classmethod
+    def of(cls, fields: Any) -> _Sheet:
+        needed = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+        missing = [field for field in needed if not isinstance(fields, dict) or fields.get(field) is None]
+        if missing:
+            raise ValueError(f"expected the fields {', '.join(needed)}, missing {', '.join(missing)}")
+        image, mode, origin, negate = (fields.get(name, "trinary") for name in ("image", "mode", "origin", "negate"))
+        if not isinstance(image, str) or not image or "\0" in image:
+            raise ValueError(f"image: expected the name of a file, got {_shown(image)}")
+        if not isinstance(mode, str) or mode.lower() not in ("trinary", "scale", "raw"):
+            raise ValueError(f"mode: expected trinary, scale or raw, got {_shown(mode)}")
+        if not isinstance(origin, list) or len(origin) != 3:
+            raise ValueError(f"origin: expected three numbers, got {_shown(origin)}")
+        x, y, yaw = (_number("origin", value) for value in origin)
+        if yaw != 0:
+            raise ValueError(f"expected an origin without rotation, got {yaw} rad")
+        if negate not in (0, 1):
+            raise ValueError(f"negate: expected 0 or 1, got {_shown(negate)}")
+        resolution, high, low = (_number(name, fields[name]) for name in ("resolution", *needed[4:]))
+        if not 0 <= low <= high <= 1:
+            raise ValueError(f"expected 0 <= free_thresh <= occupied_thresh <= 1, got {low}, {high}")
+        return cls(image, mode.lower(), resolution, (x, y), bool(negate), high, low)
+
+
+def _number(name: str, value: Any) -> float:
+    """A finite number, or text that is one: YAML 1.1 takes 1e-2 for text."""
     try:
-        sheet = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected a map_server YAML: {error}") from None
-    needed = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
-    missing = [field for field in needed if not isinstance(sheet, dict) or sheet.get(field) is None]
-    if missing:
-        raise ValueError(f"{path}: expected the fields {', '.join(needed)}, missing {', '.join(missing)}")
-    try:
-        x, y, yaw = (float(value) for value in sheet["origin"])
-        resolution, negate = float(sheet["resolution"]), bool(int(sheet["negate"]))
-        high, low = float(sheet["occupied_thresh"]), float(sheet["free_thresh"])
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected numbers, and an origin of three: {error}") from None
-    if yaw != 0:
-        raise ValueError(f"{path}: expected an origin without rotation, got {yaw} rad")
-    if not 0 <= low <= high <= 1:
-        raise ValueError(f"{path}: expected 0 <= free_thresh <= occupied_thresh <= 1, got {low}, {high}")
-    mode = str(sheet.get("mode", "trinary")).lower()
-    if mode not in ("trinary", "scale", "raw"):
-        raise ValueError(f"{path}: expected mode trinary, scale or raw, got {sheet['mode']}")
-    picture = _read_picture(Path(path).parent / str(sheet["image"]))[::-1]
-    cells = _cells(picture, mode, negate, high, low)
-    try:
-        return LoadedMap(cells, GridSpec(origin=(x, y), resolution=resolution, shape=cells.shape))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        number = math.nan if isinstance(value, bool) or "_" in str(value)[:40] else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{name}: expected a finite number, got {_shown(value)}")
+    return number
+
+
+def _shown(value: Any) -> str:
+    """A value for a message, whatever its size."""
+    return f"{value!r:.40}" if isinstance(value, (str, int, float)) else f"a {type(value).__name__}"
 
 
 def _cells(picture: np.ndarray, mode: str, negate: bool, high: float, low: float) -> np.ndarray:
@@ -169,28 +211,39 @@ def _cells(picture: np.ndarray, mode: str, negate: bool, high: float, low: float
     return cells.astype(np.int8)
 
 
-def _read_picture(path: Path) -> np.ndarray:
-    """Pixels (rows, columns, channels) from 0 to 255, the first row on top: grey, three colours, or these and alpha."""
+def _read_picture(path: Path, sheet: _Sheet) -> np.ndarray:
+    """Cells (rows, columns) int8 of a picture, the first row on top."""
     from PIL import Image, UnidentifiedImageError  # takes its time, and is needed here alone
 
+    content = io.BytesIO(files.read(path))
     try:
         with (
             warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning),
-            Image.open(path) as image,
+            Image.open(content) as image,
         ):
+            columns, rows = image.size
+            if columns * rows * len(image.getbands()) > files.most_bytes():
+                raise files.too_large(path, "pixels")
+            whole, scale = image, 1
             if image.mode.startswith("I"):  # grey of 16 bits
-                pixels = np.asarray(image, np.int64)[..., None] / 257
+                scale = 257
             elif image.has_transparency_data:
-                pixels = np.asarray(image.convert("RGBA"), np.float64)
+                whole = image.convert("RGBA")
             else:
-                pixels = np.asarray(image.convert("L" if image.mode in ("1", "L") else "RGB"), np.float64)
-                pixels = pixels.reshape(*pixels.shape[:2], -1)
-            if image.mode == "F" or not np.all((pixels >= 0) & (pixels <= 255)):
-                raise ValueError(f"expected pixels of 8 or 16 bits, got Pillow's mode {image.mode}")
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: no such picture") from None
+                whole = image.convert("L" if image.mode in ("1", "L") else "RGB")
+            pixels = np.asarray(whole).reshape(rows, columns, -1)
+            if image.mode == "F" or pixels.min(initial=0) < 0 or pixels.max(initial=0) > 255 * scale:
+                raise ValueError(f"{path}: expected pixels of 8 or 16 bits, got Pillow's mode {image.mode}")
     except UnidentifiedImageError:
         raise ValueError(f"{path}: expected a picture such as PGM or PNG, got something else") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError as error:
         raise ValueError(f"{path}: expected a whole picture that Pillow reads: {error}") from None
-    return pixels
+    except (OSError, SyntaxError):  # their words may quote the file
+        raise ValueError(f"{path}: expected a whole picture that Pillow reads, got a damaged one") from None
+    except ValueError as error:
+        if str(error).startswith(str(path)):
+            raise
+        raise ValueError(f"{path}: expected a whole picture that Pillow reads, got a damaged one") from None
+    at_once = max(2**20 // max(columns, 1), 1)  # rows
+    blocks = (pixels[row : row + at_once] / scale for row in range(0, rows, at_once))
+    return np.concatenate([_cells(block, sheet.mode, sheet.negate, sheet.high, sheet.low) for block in blocks])

@@ -80,9 +80,9 @@ def monte_carlo(
 
     Raises:
         ValueError: `runs` or `chunk` below 1 or no whole number, a chunk that does not fit into memory, no device,
-            or `parts` that should be resumed and belong to another study.
+            or `parts` that should be resumed and belong to another study, or hold files that are not a study's.
         TypeError: a key that is none.
-        OSError: a part cannot be kept; those kept before stay.
+        OSError: a part cannot be kept; those kept before stay. BlockingIOError: another study works in its folder.
     """
     hosts.check_count("runs", runs, most=2**31 - 1)  # a run's index is an int32
     if chunk is not None:
@@ -117,27 +117,31 @@ def monte_carlo(
     compile_s = time.perf_counter() - began if chunks.compile.cache_info().misses > compiled else 0.0
 
     own, finished = range(process, split.parts, processes), set[int]()
-    if parts is not None:
-        finished = hosts.in_turn(lambda: parts.open(study, own))
-    resumed = sum(map(split.runs_of, finished))
-    resumed_runs = int(hosts.gather(np.array(resumed, np.int64)).sum())
-    if parts is not None and resumed_runs:
-        parts.say(f"going on: {resumed_runs:,} of {runs:,} runs are done")
-    began = time.perf_counter()
+    try:
+        if parts is not None:
+            finished = hosts.in_turn(lambda: parts.open(study, own))
+        resumed = sum(map(split.runs_of, finished))
+        resumed_runs = int(hosts.gather(np.array(resumed, np.int64)).sum())
+        if parts is not None and resumed_runs:
+            parts.say(f"going on: {resumed_runs:,} of {runs:,} runs are done")
+        began = time.perf_counter()
 
-    def report(computed: int) -> None:
-        if progress is not None:
-            progress(runs * (resumed + computed) // sum(map(split.runs_of, own)))
+        def report(computed: int) -> None:
+            if progress is not None:
+                progress(runs * (resumed + computed) // sum(map(split.runs_of, own)))
 
-    todo = (each for part in own if part not in finished for each in split.chunks_of(part))
-    computed = _compute(program, split, todo, (key, args), report)
-    combine = _concatenate if keep_runs else _add_up
-    totals = _totals(own, finished, split, computed, combine, parts)
-    if processes > 1:
-        totals = _exchange(list(totals), split.parts, traced.outputs)
-    total, run_s = combine(totals), time.perf_counter() - began
-    value = _kept(total, traced.outputs, runs) if keep_runs else _unpacked(total, traced.outputs)
-    return Result(value, split.chunk, int(counts.sum()), processes, resumed_runs, compile_s, run_s)
+        todo = (each for part in own if part not in finished for each in split.chunks_of(part))
+        computed = _compute(program, split, todo, (key, args), report)
+        combine = _concatenate if keep_runs else _add_up
+        totals = _totals(own, finished, split, computed, combine, parts)
+        if processes > 1:
+            totals = _exchange(list(totals), split.parts, traced.outputs)
+        total, run_s = combine(totals), time.perf_counter() - began
+        value = _kept(total, traced.outputs, runs) if keep_runs else _unpacked(total, traced.outputs)
+        return Result(value, split.chunk, int(counts.sum()), processes, resumed_runs, compile_s, run_s)
+    finally:
+        if parts is not None:
+            parts.release()
 
 
 def _check_key(key: Any) -> None:

@@ -17,9 +17,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxlocmap import files
+from jaxlocmap.lock import Lock
+
 _PARTS = 256  # at most: so little of a long study is lost when it dies
 _SYNC_EVERY = 1.0  # s; forcing a file to disk takes milliseconds, a quick study's part less
-_MANIFEST = "manifest.json"
+_FOLDER, _MANIFEST = "parts", "manifest.json"
+_LOCK = ".lock-"  # and the number of the process
+_MARK = "jaxlocmap study"  # what a manifest is known by
+_PART_MARK = b"jaxlocmap part\n"  # and the file of a part
 
 
 class Split(NamedTuple):
@@ -84,11 +90,12 @@ def _digest(*contents: bytes) -> str:
 
 
 class Parts:
-    """Where a study keeps its finished parts.
+    """Where a study keeps its finished parts: a folder `parts` of its own, in the folder of its report.
 
     A part's file is written under another name and then renamed, so it is there whole or not at all. Its checksum
     spans its numbers, its place and its study: a file that is damaged or from elsewhere is told, and its part done
     again. Once a second all files written since are forced to disk, so a power cut costs little more than a second.
+    Nothing is overwritten or removed but what a manifest of a study names.
     """
 
     def __init__(
@@ -103,16 +110,18 @@ class Parts:
         """Nothing is touched before a study starts.
 
         Args:
-            folder: of one study alone, made if need be. Several processes may share one or have one each.
+            folder: in which `parts` is made, and may hold whatever else. Several processes of one study may share it or
+                have one each.
             settings: plain values by name that the study was asked for; to go on, they must be the same.
             resume: go on with the parts that are there.
             discard: start anew where there are any.
             say: called with a sentence on what is found, discarded or damaged.
         """
-        self.folder, self.settings, self.say = Path(folder), dict(settings or {}), say
+        self.folder, self.settings, self.say = Path(folder) / _FOLDER, dict(settings or {}), say
         self.resume, self.discard = resume, discard
         self.runs_kept = 0  # in this process's parts
         self._manifest: dict[str, Any] = {}
+        self._lock: Lock | None = None
         self._synced, self._unsynced = -math.inf, list[Path]()
 
     def recorded_chunk(self) -> int | None:
@@ -126,19 +135,44 @@ class Parts:
             manifest: of the study, from the function of that name.
 
         Raises:
-            ValueError: it should go on, but the folder belongs to another study; every difference is named. Or it
-                should neither go on nor discard what is there, and something is.
+            ValueError: it should go on, but the folder belongs to another study, every difference of which is named,
+                or its manifest is damaged or missing. Or it should neither go on nor discard what is there, and
+                something is. Or what is there is not a study's.
+            BlockingIOError: another study is working there.
         """
+        if self.folder.is_symlink():
+            raise ValueError(f"parts: expected a folder, got a link: {self.folder}")
+        if self._lock is None:
+            Lock.check(self._lock_file())
         found, asked = self._found(), self._asked(manifest)
-        if not (self.resume or self.discard) and (runs := self._runs_there(found or asked)):
+        if found is None:
+            self._check_damage()
+            return
+        if not (self.resume or self.discard) and (runs := self._runs_there(found)):
             whose = "this" if found == asked else "another"
             raise ValueError(
                 f"parts: expected resume or discard, since {self.folder} holds {runs:,} finished runs of {whose} study"
             )
-        if self.resume and found is not None and found != asked:
+        if self.resume and found != asked:
             names = [name for name in {**found, **asked} if found.get(name) != asked.get(name)]
             differences = "; ".join(f"{name} was {found.get(name)!r}, is {asked.get(name)!r}" for name in names)
             raise ValueError(f"resume: expected the study that {self.folder} belongs to, got another: {differences}")
+
+    def _check_damage(self) -> None:
+        """Raise where there is no manifest to go by and something that may be lost."""
+        there, manifest = self._part_files(), self.folder / _MANIFEST
+        foreign = [file for file in there if not _is_part(file)]
+        if manifest.exists() and not _may_be_manifest(manifest):
+            foreign.append(manifest)
+        if foreign:
+            names = ", ".join(file.name for file in foreign[:3])
+            raise ValueError(f"parts: expected a study's files in {self.folder}, got others: {names}; none was touched")
+        if (there or manifest.exists()) and not self.discard:
+            what = "damaged" if manifest.exists() else "missing"
+            raise ValueError(
+                f"parts: expected a study to go on with in {self.folder}, got {len(there)} finished parts whose "
+                f"{_MANIFEST} is {what}; discard starts anew"
+            )
 
     def open(self, manifest: Mapping[str, Any], parts: Iterable[int]) -> set[int]:
         """Make the folder ready for a study.
@@ -150,14 +184,17 @@ class Parts:
             Those of `parts` that are finished and undamaged.
 
         Raises:
-            ValueError: as `check`. OSError: the folder cannot be read or written.
+            ValueError, BlockingIOError: as `check`. OSError: the folder cannot be read or written.
         """
         self.check(manifest)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock = self._lock or Lock(self._lock_file())
         found, asked = self._found(), self._asked(manifest)
         if not self.resume or found is None:
-            self._discard(found, asked)
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._write(_MANIFEST, json.dumps(asked, indent=1).encode())
+            self._discard(found)
+            self._write(
+                _MANIFEST, json.dumps({"made by": _MARK, "digest": _own_digest(asked), **asked}, indent=1).encode()
+            )
         self._manifest = asked
         whole = {part for part in parts if self._is_whole(part)}
         self.runs_kept = sum(map(self._split(asked).runs_of, whole))
@@ -173,7 +210,7 @@ class Parts:
         for array in arrays:
             np.lib.format.write_array(contents, np.asarray(array), allow_pickle=False)
         try:
-            self._write(_name(part), self._checksum(part, contents.getvalue()) + contents.getvalue())
+            self._write(_name(part), _PART_MARK + self._checksum(part, contents.getvalue()) + contents.getvalue())
         except OSError as error:
             raise OSError(
                 f"parts: expected to keep part {part} in {self.folder}, got: {error.strerror}; "
@@ -188,30 +225,57 @@ class Parts:
             OSError: there is none. ValueError: it is damaged, or not of this study.
         """
         whole = (self.folder / _name(part)).read_bytes()
-        checksum, contents = whole[: hashlib.sha256().digest_size], whole[hashlib.sha256().digest_size :]
-        if checksum != self._checksum(part, contents):
+        begin = len(_PART_MARK) + hashlib.sha256().digest_size
+        contents = whole[begin:]
+        if whole[:begin] != _PART_MARK + self._checksum(part, contents):
             raise ValueError(f"parts: expected part {part} of this study in {self.folder}, got a damaged file")
         stream, arrays = io.BytesIO(contents), []
         while stream.tell() < len(contents):
             arrays.append(np.lib.format.read_array(stream, allow_pickle=False))
         return tuple(arrays)
 
+    def release(self) -> None:
+        """Let another study work in the folder; what is kept stays."""
+        if self._lock is not None:
+            self._lock.release()
+        self._lock = None
+
     def clear(self) -> None:
-        """Remove what is kept, and the folder if nothing else is in it: for when the study's report is written."""
-        for pattern in (f"{_name()}*", f"{_MANIFEST}*"):
-            for file in self.folder.glob(pattern):
-                file.unlink(missing_ok=True)
-        self._unsynced = []
+        """Remove what is kept, and the folder if nothing else is in it: for when the study's report is written.
+
+        Raises:
+            BlockingIOError: another study has begun to work there.
+        """
+        found = self._found()
+        if found is not None:
+            self._lock = self._lock or Lock(self._lock_file())
+            names = [_name(part) for part in range(self._split(found).parts)]
+            self._remove([*(self.folder / name for name in names), self.folder / _MANIFEST])
+            self.release()
+            for file in self.folder.glob(f"{_LOCK}*"):  # of processes that were killed
+                with contextlib.suppress(OSError):
+                    Lock(file).release()
         with contextlib.suppress(OSError):
             self.folder.rmdir()
 
+    def _remove(self, files_of_study: Iterable[Path]) -> None:
+        for file in files_of_study:
+            for path in (file, *files.left_behind(self.folder, file.name)):
+                path.unlink(missing_ok=True)
+        self._unsynced = []
+
+    def _lock_file(self) -> Path:
+        return self.folder / f"{_LOCK}{jax.process_index()}"
+
     def _found(self) -> dict[str, Any] | None:
-        """The manifest in the folder; None if there is none, or none that can be read."""
+        """The manifest in the folder; None if there is none, or none that can be believed."""
         try:
             found = json.loads((self.folder / _MANIFEST).read_bytes())
-            return found if self._split(found).parts > 0 else None
-        except (FileNotFoundError, ValueError, TypeError, KeyError, ZeroDivisionError):
-            return None
+            if found.pop("made by") == _MARK and found.pop("digest") == _own_digest(found):
+                return found
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            pass
+        return None
 
     def _asked(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
         return json.loads(json.dumps({**self.settings, **manifest}))  # as it will be read again
@@ -220,18 +284,23 @@ class Parts:
     def _split(manifest: Mapping[str, Any]) -> Split:
         return Split(manifest["runs"], manifest["chunk"])
 
-    def _discard(self, found: dict[str, Any] | None, asked: dict[str, Any]) -> None:
-        if not self.resume:
-            if runs := self._runs_there(found or asked):
-                self.say(f"discarding {runs:,} finished runs in {self.folder}")
-        else:
-            damaged = f", {_MANIFEST} is damaged" if (self.folder / _MANIFEST).exists() else ""
-            self.say(f"nothing to resume in {self.folder}{damaged}: starting with the first run")
-        self.clear()
+    def _discard(self, found: dict[str, Any] | None) -> None:
+        if self.resume:
+            self.say(f"nothing to resume in {self.folder}: starting with the first run")
+        elif found is not None and (runs := self._runs_there(found)):
+            self.say(f"discarding {runs:,} finished runs in {self.folder}")
+        elif found is None and (parts := self._part_files()):
+            self.say(f"discarding {len(parts):,} finished parts in {self.folder}")
+        names = [] if found is None else [_name(part) for part in range(self._split(found).parts)]
+        self._remove([*self._part_files(), *(self.folder / name for name in names), self.folder / _MANIFEST])
+
+    def _part_files(self) -> list[Path]:
+        """Files that are named like parts."""
+        return [file for part in range(_PARTS) if (file := self.folder / _name(part)).exists()]
 
     def _runs_there(self, manifest: Mapping[str, Any]) -> int:
-        split, there = self._split(manifest), {file.name for file in self.folder.glob(f"{_name()}*")}
-        return sum(split.runs_of(part) for part in range(split.parts) if _name(part) in there)
+        split = self._split(manifest)
+        return sum(split.runs_of(part) for part in range(split.parts) if (self.folder / _name(part)).exists())
 
     def _is_whole(self, part: int) -> bool:
         try:
@@ -249,16 +318,12 @@ class Parts:
 
     def _write(self, name: str, contents: bytes) -> None:
         """All of it or nothing, whenever the program or the machine dies."""
-        temporary, sync = self.folder / f"{name}.writing", time.monotonic() > self._synced + _SYNC_EVERY
-        try:
+        sync = time.monotonic() > self._synced + _SYNC_EVERY
+        with files.writing(self.folder / name) as temporary:
             temporary.write_bytes(contents)
             if sync:
                 for path in (*self._unsynced, temporary):
                     _sync(path)
-            temporary.replace(self.folder / name)
-        except OSError:
-            temporary.unlink(missing_ok=True)
-            raise
         if sync:
             with contextlib.suppress(OSError):  # not every file system lets folders be forced to disk
                 _sync(self.folder)
@@ -267,8 +332,26 @@ class Parts:
             self._unsynced.append(self.folder / name)
 
 
-def _name(part: int | None = None) -> str:
-    return "part-" if part is None else f"part-{part:03d}"
+def _name(part: int) -> str:
+    return f"part-{part:03d}"
+
+
+def _own_digest(study: Mapping[str, Any]) -> str:
+    return _digest(json.dumps(study, sort_keys=True).encode())
+
+
+def _is_part(file: Path) -> bool:
+    """Whether this is a part's file, damaged or not; an empty one holds nothing that could be lost."""
+    with file.open("rb") as stream:
+        begin = stream.read(len(_PART_MARK))
+    return begin in (_PART_MARK, b"")
+
+
+def _may_be_manifest(file: Path) -> bool:
+    """Whether this may be what is left of a study's manifest."""
+    with file.open("rb") as stream:
+        begin = stream.read(1000)
+    return not begin or _MARK.encode() in begin
 
 
 def _sync(path: Path) -> None:

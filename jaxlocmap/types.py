@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import checks
+from jaxlocmap import checks, files
 
 
 class Params(NamedTuple):
@@ -73,7 +73,7 @@ class Params(NamedTuple):
     def save(self, path: str | Path) -> None:
         """Write `{"Q": ..., "R": ..., "l_occ": ..., "l_free": ...}` as JSON."""
         fields = {name: np.asarray(value).tolist() for name, value in self._asdict().items()}
-        Path(path).write_text(json.dumps(fields, indent=2) + "\n")
+        files.write(path, json.dumps(fields, indent=2) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> Params:
@@ -83,10 +83,11 @@ class Params(NamedTuple):
             ValueError: not JSON, a missing, unknown or non-numeric field, or a value that `check` refuses;
                 the message starts with the path.
         """
-        try:
-            fields = json.loads(Path(path).read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}: expected a JSON object with {cls._fields}: {error}") from None
+        with files.reading(path, f"a JSON object with {cls._fields}"):
+            try:
+                fields = json.loads(files.read(path))
+            except (json.JSONDecodeError, UnicodeDecodeError) as error:
+                raise ValueError(f"expected a JSON object with {cls._fields}: {error}") from None
         if not isinstance(fields, dict) or set(fields) != set(cls._fields):
             got = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
             raise ValueError(f"{path}: expected exactly the fields {cls._fields}, got {got}")
@@ -97,7 +98,7 @@ class Params(NamedTuple):
                     raise ValueError(f"{name}: expected numbers, got {fields[name]!r}")
             params = cls(**{name: jnp.asarray(value.astype(float)) for name, value in values.items()})
             params.check()
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise ValueError(f"{path}: {error}") from None
         return params
 

@@ -215,13 +215,13 @@ def test_what_was_finished_when_memory_ran_out_stays(monkeypatch, tmp_path):
         return program._replace(run=run)
 
     failing.cache_info = compile.cache_info
-    parts = Parts(tmp_path / "parts")
+    parts = Parts(tmp_path)
     monkeypatch.setattr(chunks, "compile", failing)
     with pytest.raises(ValueError, match="chunk: expected one that fits"):
         monte_carlo(Silent(3), KEY, 400, chunk=8, parts=parts, devices=DEVICES)
     monkeypatch.undo()
     assert 0 < parts.runs_kept <= 29 * 8
-    resumed = monte_carlo(Silent(3), KEY, 400, chunk=8, parts=Parts(tmp_path / "parts", resume=True), devices=DEVICES)
+    resumed = monte_carlo(Silent(3), KEY, 400, chunk=8, parts=Parts(tmp_path, resume=True), devices=DEVICES)
     assert resumed.resumed_runs == parts.runs_kept
     np.testing.assert_array_equal(resumed.value, monte_carlo(Silent(3), KEY, 400, chunk=8, devices=DEVICES).value)
 

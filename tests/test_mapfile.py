@@ -119,16 +119,22 @@ def test_any_name_of_a_file_comes_back(tmp_path, name):
     np.testing.assert_array_equal(load_map(tmp_path / f"{name}.yaml").cells, cells)
 
 
-@pytest.mark.parametrize("name", ["floor/kitchen", "a/b: c/- d", "../beside"])
-def test_a_name_with_folders_is_taken_from_the_folder_on(tmp_path, name):
-    cells = save_map(tmp_path / "maps", np.array([[-4.0, 4.0]]), GridSpec((0.0, 0.0), 1.0, (1, 2)), name=name)
-    np.testing.assert_array_equal(load_map(tmp_path / "maps" / f"{name}.yaml").cells, cells)
+@pytest.mark.parametrize("name", ["", ".", "..", "/", "floor/kitchen", "../beside", "a\0b"])
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+    with pytest.raises(ValueError, match="name: expected the name of a file, without folder and suffix"):
+        save_map(tmp_path / "maps", np.zeros((1, 1)), GridSpec((0.0, 0.0), 1.0, (1, 1)), name=name)
+    assert not list(tmp_path.rglob("*"))
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", "/", "floor/.."])
-def test_a_name_that_is_none_is_refused(tmp_path, name):
-    with pytest.raises(ValueError, match="name: expected the name of a file without suffix"):
-        save_map(tmp_path, np.zeros((1, 1)), GridSpec((0.0, 0.0), 1.0, (1, 1)), name=name)
+def test_a_map_replaces_links_and_not_what_they_point_to(tmp_path):
+    outside = tmp_path / "outside"
+    outside.write_text("mine")
+    (tmp_path / "maps").mkdir()
+    for name in ("map.pgm", "map.yaml"):
+        (tmp_path / "maps" / name).symlink_to(outside)
+    cells = save_map(tmp_path / "maps", np.array([[-4.0, 4.0]]), GridSpec((0.0, 0.0), 1.0, (1, 2)))
+    np.testing.assert_array_equal(load_map(tmp_path / "maps" / "map.yaml").cells, cells)
+    assert outside.read_text() == "mine"
 
 
 # --- What others wrote ---
@@ -252,21 +258,31 @@ def test_a_missing_field_is_named(tmp_path, field):
     ("old", "new", "message"),
     [
         ("[1, 2, 0]", "[1, 2, 0.1]", "origin without rotation, got 0.1 rad"),
-        ("[1, 2, 0]", "[1, 2, .nan]", "origin without rotation"),
-        ("[1, 2, 0]", "[1, 2]", "an origin of three"),
-        ("[1, 2, 0]", "3", "an origin of three"),
-        ("[1, 2, 0]", "[.inf, 2, 0]", "origin: expected two finite"),
-        ("0.5", "wide", "expected numbers"),
+        ("[1, 2, 0]", "[1, 2, .nan]", "origin: expected a finite number, got nan"),
+        ("[1, 2, 0]", "[1, 2]", "origin: expected three numbers, got a list"),
+        ("[1, 2, 0]", "3", "origin: expected three numbers, got 3"),
+        ("[1, 2, 0]", "[.inf, 2, 0]", "origin: expected a finite number, got inf"),
+        ("0.5", "wide", "resolution: expected a finite number, got 'wide'"),
+        ("0.5", "true", "resolution: expected a finite number, got True"),
+        ("0.5", "1" * 5000, "expected a map_server YAML"),
+        ("0.5", "1e999", "resolution: expected a finite number"),
+        ("0.5", "{a: b}", "resolution: expected a finite number, got a dict"),
         ("0.5", "-0.5", "resolution: expected metres per cell > 0"),
-        ("0.5", ".nan", "resolution: expected metres per cell > 0"),
-        ("negate: 0", "negate: maybe", "expected numbers"),
-        ("0.65", "[1]", "expected numbers"),
-        ("image: map.pgm", "image: map.pgm\nmode: binary", "expected mode trinary, scale or raw, got binary"),
-        ("image: map.pgm", "image: map.pgm\nmode:", "expected mode trinary, scale or raw, got None"),
+        ("0.5", ".nan", "resolution: expected a finite number, got nan"),
+        ("negate: 0", "negate: maybe", "negate: expected 0 or 1, got 'maybe'"),
+        ("negate: 0", "negate: 2", "negate: expected 0 or 1, got 2"),
+        ("negate: 0", "negate: !!bool ja", "expected a map_server YAML"),
+        ("0.65", "[1]", "occupied_thresh: expected a finite number, got a list"),
+        ("0.196", "-1", "expected 0 <= free_thresh <= occupied_thresh <= 1, got -1.0, 0.65"),
+        ("image: map.pgm", "image: map.pgm\nmode: binary", "mode: expected trinary, scale or raw, got 'binary'"),
+        ("image: map.pgm", "image: map.pgm\nmode:", "mode: expected trinary, scale or raw, got a NoneType"),
         ("image: map.pgm", "image:", "missing image"),
         ("0.196", "0.7", "expected 0 <= free_thresh <= occupied_thresh <= 1, got 0.7, 0.65"),
-        ("0.65", ".nan", "expected 0 <= free_thresh <= occupied_thresh <= 1, got 0.196, nan"),
+        ("0.65", ".nan", "occupied_thresh: expected a finite number, got nan"),
         ("image: map.pgm", "image: [", "expected a map_server YAML"),
+        ("image: map.pgm", "image: [map.pgm]", "image: expected the name of a file, got a list"),
+        ("image: map.pgm", "image: &x [*x]", "expected no aliases"),
+        ("image: map.pgm", "image: " + "[" * 10_000, "expected a map_server YAML, got one that cannot be read"),
         (SHEET, "", "expected the fields"),
         (SHEET, "- 1\n- 2\n", "expected the fields"),
         (SHEET, "just words", "expected the fields"),

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -28,10 +29,18 @@ def folder(tmp_path):
     return tmp_path / "out" / "parts"
 
 
+def at(folder, *args, **kwargs):
+    """Parts that are kept in the folder."""
+    return Parts(folder.parent, *args, **kwargs)
+
+
 def opened(folder, study=STUDY, **kwargs):
     said = []
-    parts = Parts(folder, say=said.append, **{"discard": not kwargs.get("resume")} | kwargs)
-    return parts, parts.open(study, range(Split(study["runs"], study["chunk"]).parts)), said
+    parts = at(folder, say=said.append, **{"discard": not kwargs.get("resume")} | kwargs)
+    try:
+        return parts, parts.open(study, range(Split(study["runs"], study["chunk"]).parts)), said
+    finally:
+        parts.release()
 
 
 def the_file(folder, part):
@@ -95,9 +104,9 @@ def test_every_damage_is_told(folder):
 
 def test_a_part_of_another_study_is_told(tmp_path):
     for seed in (1, 2):
-        opened(tmp_path / str(seed), STUDY | {"seed": seed})[0].save(0, ARRAYS)
-    the_file(tmp_path / "2", 0).replace(the_file(tmp_path / "1", 0))
-    assert opened(tmp_path / "1", resume=True)[1] == set()
+        opened(tmp_path / str(seed) / "parts", STUDY | {"seed": seed})[0].save(0, ARRAYS)
+    the_file(tmp_path / "2" / "parts", 0).replace(the_file(tmp_path / "1" / "parts", 0))
+    assert opened(tmp_path / "1" / "parts", resume=True)[1] == set()
 
 
 def test_another_study_is_refused_and_each_difference_named(folder):
@@ -135,21 +144,140 @@ def test_nothing_to_resume_is_said(folder):
     assert opened(folder, resume=True)[2] == [f"nothing to resume in {folder}: starting with the first run"]
 
 
-@pytest.mark.parametrize("damage", ["", "{", "[]", "3", '{"runs": 30}', '{"runs": 30, "chunk": 0}', '{"runs": "a"}'])
-def test_with_a_damaged_manifest_nothing_is_believed(folder, damage):
-    opened(folder)[0].save(0, ARRAYS)
-    (folder / "manifest.json").write_text(damage)
-    assert Parts(folder, resume=True).recorded_chunk() is None
-    _, finished, said = opened(folder, resume=True)
-    assert finished == set()
-    assert said == [f"nothing to resume in {folder}, manifest.json is damaged: starting with the first run"]
+DAMAGE = {
+    "emptied": lambda text: "",
+    "cut": lambda text: text[:-10],
+    "list": lambda text: f'["jaxlocmap study", {text}]',
+    "chunk": lambda text: text.replace('"chunk": 4', '"chunk": 200'),
+    "true": lambda text: text.replace('"chunk": 4', '"chunk": true'),
+    "nested": lambda text: '{"made by": "jaxlocmap study", "x": ' + "[" * 100_000,
+    "missing": lambda text: None,
+}
 
 
-def test_what_was_being_written_when_the_program_died_is_no_part(folder):
+def damage(folder, how):
+    path = folder / "manifest.json"
+    text = DAMAGE[how](path.read_text())
+    if text is None:
+        path.unlink()
+    else:
+        path.write_text(text)
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_with_a_damaged_manifest_nothing_is_believed_and_nothing_lost(folder, how):
+    for part in (0, 5):
+        opened(folder, resume=True)[0].save(part, ARRAYS)
+    damage(folder, how)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    assert at(folder, resume=True).recorded_chunk() is None
+    told = rf"got 2 finished parts whose manifest.json is {'missing' if how == 'missing' else 'damaged'}; discard"
+    for flags in ({"resume": True}, {"discard": False}):
+        with pytest.raises(ValueError, match=told):
+            opened(folder, **flags)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+    _, finished, said = opened(folder, discard=True)
+    assert (finished, said) == (set(), [f"discarding 2 finished parts in {folder}"])
+    assert [file.name for file in folder.iterdir()] == ["manifest.json"]
+
+
+@pytest.mark.parametrize("flags", [{"resume": True}, {"discard": True}, {"discard": False}])
+@pytest.mark.parametrize("name", ["manifest.json", "part-000", "part-255"])
+def test_a_user_s_own_files_are_refused_and_stay(folder, name, flags):
+    folder.mkdir(parents=True)
+    (folder / name).write_text('{"name": "my data"}')
+    (folder / "part-000.stl").write_text("solid")
+    with pytest.raises(ValueError, match=f"got others: {name}; none was touched"):
+        opened(folder, **flags)
+    assert sorted(file.name for file in folder.iterdir()) == sorted({name, "part-000.stl"})
+    assert (folder / name).read_text() == '{"name": "my data"}'
+
+
+def test_what_is_beside_a_study_s_files_stays_to_the_end(folder):
+    """Names that begin as a study's do, in the folder of the report and in its own."""
+    names = ["part-list.csv", "part-000.stl", "part-time-job.txt", "manifest.json.bak", "part-200", "manifest.json"]
+    folder.mkdir(parents=True)
+    for name in names:
+        (folder.parent / name).write_text("mine")
+    for name in names[:4]:
+        (folder / name).write_text("mine")
     parts, *_ = opened(folder)
     parts.save(0, ARRAYS)
-    (folder / "part-001.writing").write_bytes(the_file(folder, 0).read_bytes()[:9])
+    opened(folder, discard=True)
+    parts.clear()
+    assert sorted(file.name for file in folder.iterdir()) == sorted(names[:4])
+    assert all((folder.parent / name).read_text() == "mine" for name in names)
+
+
+def test_links_in_the_folder_lead_nowhere(folder, tmp_path):
+    outside = tmp_path / "outside.txt"
+    outside.write_text("mine")
+    folder.mkdir(parents=True)
+    opened(folder)
+    for name in ("part-001", "part-002.writing", ".part-002.writing"):
+        (folder / name).symlink_to(outside)
+    parts, *_ = opened(folder, resume=True)
+    for part in range(8):
+        parts.save(part, ARRAYS)
+    assert not (folder / "part-001").is_symlink()
+    (folder / "manifest.json").unlink()
+    (folder / "manifest.json").symlink_to(outside)
+    with pytest.raises(ValueError, match=r"got others: manifest\.json; none was touched"):
+        opened(folder, discard=True)
+    (folder / "manifest.json").unlink()
+    (folder / ".lock-0").symlink_to(outside)
+    with pytest.raises(OSError, match=r"\.lock-0"):
+        opened(folder, discard=True)
+    assert outside.read_text() == "mine"
+
+
+def test_a_folder_that_is_a_link_is_refused(folder, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    folder.parent.mkdir(parents=True)
+    folder.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match="parts: expected a folder, got a link"):
+        opened(folder)
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+# --- One study at a time ---
+
+
+def test_a_second_study_is_refused_while_the_first_works_and_goes_on_after(folder):
+    first = at(folder, discard=True)
+    first.open(STUDY, range(8))
+    first.save(0, ARRAYS)
+    told = f"{folder}: expected a folder that no other study uses, got one in use by process {os.getpid()} on "
+    for flags in ({"resume": True}, {"discard": True}):
+        with pytest.raises(BlockingIOError, match=re.escape(told)):
+            opened(folder, **flags)
+    first.save(1, ARRAYS)
+    first.release()
+    assert opened(folder, resume=True)[1] == {0, 1}
+
+
+@pytest.mark.slow
+def test_the_lock_of_a_killed_process_holds_nobody_up(folder):
+    code = f"""if 1:
+        import os, signal, sys
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        import test_parts, pathlib
+        parts = test_parts.at(pathlib.Path({str(folder)!r}))
+        parts.open(test_parts.STUDY, range(8))
+        os.kill(os.getpid(), signal.SIGKILL)
+    """
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    assert (folder / ".lock-0").exists()
+    assert opened(folder, resume=True)[1] == set()
+
+
+def test_what_was_being_written_when_the_program_died_is_no_part_and_goes_with_the_study(folder):
+    parts, *_ = opened(folder)
+    parts.save(0, ARRAYS)
+    (folder / ".part-001.0123456789abcdef.writing").write_bytes(the_file(folder, 0).read_bytes()[:9])
     assert opened(folder, resume=True)[1] == {0}
+    parts.clear()
+    assert not folder.exists()
 
 
 def test_clearing_leaves_what_is_not_the_study_s(folder):
@@ -272,10 +400,10 @@ def test_a_stopped_study_goes_on_to_the_same_last_bit(folder, keep_runs):
     kwargs = {"keep_runs": keep_runs, "devices": jax.local_devices()[:1]}
     whole = monte_carlo(walk, KEY, 30, 2.0, chunk=4, **kwargs)
     assert whole.resumed_runs == 0
-    stopped(20, chunk=4, parts=Parts(folder), **kwargs)
+    stopped(20, chunk=4, parts=at(folder), **kwargs)
     the_file(folder, 1).write_bytes(b"torn")
     done = []
-    parts = Parts(folder, resume=True)
+    parts = at(folder, resume=True)
     # The chunk need not be said again.
     result = monte_carlo(walk, KEY, 30, 2.0, parts=parts, progress=done.append, **kwargs)
     np.testing.assert_array_equal(result.value, whole.value)
@@ -283,7 +411,7 @@ def test_a_stopped_study_goes_on_to_the_same_last_bit(folder, keep_runs):
     assert done == [20, 24, 28, 30]  # part 1, then the last three
     assert parts.runs_kept == 30
     # All is there now, so nothing is computed.
-    parts = Parts(folder, resume=True)
+    parts = at(folder, resume=True)
     result = monte_carlo(walk, KEY, 30, 2.0, parts=parts, progress=pytest.fail, **kwargs)
     np.testing.assert_array_equal(result.value, whole.value)
     assert result.resumed_runs == 30
@@ -291,7 +419,7 @@ def test_a_stopped_study_goes_on_to_the_same_last_bit(folder, keep_runs):
 
 def test_parts_of_many_chunks_go_on_as_well(folder):
     def long(resume=False, **kwargs):
-        return monte_carlo(walk, KEY, 1000, 2.0, chunk=1, parts=Parts(folder, resume=resume), **kwargs)
+        return monte_carlo(walk, KEY, 1000, 2.0, chunk=1, parts=at(folder, resume=resume), **kwargs)
 
     whole = monte_carlo(walk, KEY, 1000, 2.0, chunk=1)
 
@@ -308,24 +436,24 @@ def test_parts_of_many_chunks_go_on_as_well(folder):
 
 
 def test_a_wrong_folder_is_refused_before_anything_is_compiled_or_touched(folder):
-    stopped(20, chunk=4, parts=Parts(folder, {"motion": "arc"}))
+    stopped(20, chunk=4, parts=at(folder, {"motion": "arc"}))
     compiles = chunks.compile.cache_info().misses
 
     def other(key, scale):
         return walk(key, scale) + 1
 
     with pytest.raises(ValueError, match=r"motion was 'arc', is 'euler'; .*program was '\w+', is '\w+'$"):
-        monte_carlo(other, KEY, 30, 2.0, chunk=4, parts=Parts(folder, {"motion": "euler"}, resume=True))
+        monte_carlo(other, KEY, 30, 2.0, chunk=4, parts=at(folder, {"motion": "euler"}, resume=True))
     with pytest.raises(ValueError, match=r"another: chunk was 4, is 5$"):
-        monte_carlo(walk, KEY, 30, 2.0, chunk=5, parts=Parts(folder, {"motion": "arc"}, resume=True))
+        monte_carlo(walk, KEY, 30, 2.0, chunk=5, parts=at(folder, {"motion": "arc"}, resume=True))
     with pytest.raises(ValueError, match=r"another: runs was 30, is 29$"):
-        monte_carlo(walk, KEY, 29, 2.0, parts=Parts(folder, {"motion": "arc"}, resume=True))
+        monte_carlo(walk, KEY, 29, 2.0, parts=at(folder, {"motion": "arc"}, resume=True))
     assert len(list(folder.glob("part-*"))) >= 5
     assert chunks.compile.cache_info().misses == compiles
 
 
 def test_a_study_whose_disk_is_full_ends_and_goes_on_later(folder):
-    parts, kwargs = Parts(folder), {"chunk": 4, "devices": jax.local_devices()[:1]}
+    parts, kwargs = at(folder), {"chunk": 4, "devices": jax.local_devices()[:1]}
     with contextlib.ExitStack() as later:
 
         def progress(done):
@@ -335,6 +463,6 @@ def test_a_study_whose_disk_is_full_ends_and_goes_on_later(folder):
         with pytest.raises(OSError, match="expected to keep part 3"):
             monte_carlo(walk, KEY, 30, 2.0, parts=parts, progress=progress, **kwargs)
     assert parts.runs_kept == 12
-    result = monte_carlo(walk, KEY, 30, 2.0, parts=Parts(folder, resume=True))
+    result = monte_carlo(walk, KEY, 30, 2.0, parts=at(folder, resume=True))
     np.testing.assert_array_equal(result.value, monte_carlo(walk, KEY, 30, 2.0, chunk=4).value)
     assert result.resumed_runs == 12

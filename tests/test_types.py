@@ -107,7 +107,7 @@ def test_a_file_that_holds_no_parameters_is_refused_by_path_and_field(content, m
 def test_a_file_that_is_not_there_says_so(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"missing\.json"):
         Params.load(tmp_path / "missing.json")
-    with pytest.raises(IsADirectoryError, match=str(tmp_path.name)):
+    with pytest.raises(ValueError, match=f"{tmp_path.name}: expected a file, got a folder"):
         Params.load(tmp_path)
 
 

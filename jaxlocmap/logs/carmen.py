@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxlocmap import files
 from jaxlocmap.logs.fan import Fan, check_fov, directions, fits
 from jaxlocmap.logs.record import Log
 from jaxlocmap.logs.text import lines, numbers, whole
@@ -32,7 +33,7 @@ _PARAM = re.compile(
 
 class _Scan(NamedTuple):
     fan: Fan
-    ranges: list[float]
+    ranges: np.ndarray
     pose: list[float] | None  # the scanner's x, y, theta; None: to be had from odometry
     stamp: float
     line: int
@@ -91,6 +92,11 @@ def read_carmen(
     data set repository (D. Haehnel, for Intel).
     """
     _check_arguments(fov, max_range, laser_offset)
+    with files.reading(path, "a CARMEN log"):
+        return _read(path, fov, max_range, laser_offset)
+
+
+def _read(path: str | Path, fov: float | None, max_range: float | None, laser_offset: Sequence[float] | None) -> Log:
     posed, raw, odometry = [], [], []
     params, unknown, short = {}, 0, None
     kind, fields, where = "", [], ""
@@ -185,7 +191,7 @@ def _scan(kind: str, fields: list[str], number: int, where: str) -> _Scan:
         )
     return _Scan(
         fan=_stated_fan(fields, beams, where) if head else Fan(beams),
-        ranges=numbers(fields[begin:end], [f"range {k + 1}" for k in range(beams)], where, finite=False),
+        ranges=np.array(numbers(fields[begin:end], [f"range {k + 1}" for k in range(beams)], where, finite=False)),
         pose=numbers(fields[rest : rest + 3], middle[:3], where) if middle else None,
         stamp=numbers(fields[-1:], ("time",), where)[0],
         line=number,

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from jaxlocmap import files
 from jaxlocmap.logs.text import read_bytes
 
 _HEADER = 128  # bytes
@@ -39,6 +40,11 @@ def read_matrices(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarra
 
     Source: MathWorks, "MAT-File Format", level 5.
     """
+    with files.reading(path, "a MATLAB file of version 5 to 7"):
+        return _read(path, names)
+
+
+def _read(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     data = read_bytes(path)
     order: _Order = "big" if data[126:128] == b"MI" else "little"
     if data[124:128] not in (b"\0\1IM", b"\1\0MI"):
@@ -58,10 +64,17 @@ def read_matrices(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarra
 
 def _variables(path: str | Path, data: bytes, order: _Order) -> Iterator[tuple[str, bytes]]:
     """Yield name and content of each variable."""
+    room = files.most_bytes()
     try:
         for kind, content in _elements(data, order):
             if kind == _COMPRESSED:
-                kind, content = next(_elements(zlib.decompress(content), order), (0, b""))
+                stream = zlib.decompressobj()
+                unpacked = stream.decompress(content, room + 1)
+                if not stream.eof and len(unpacked) <= room:
+                    raise ValueError("compressed data that end early")
+                if (room := room - len(unpacked)) < 0:
+                    raise files.too_large(path, "unpacked content")
+                kind, content = next(_elements(unpacked, order), (0, b""))
             if kind != _MATRIX:
                 raise ValueError(f"expected a matrix, got an element of type {kind}")
             parts = list(itertools.islice(_elements(content, order), 3))
@@ -69,6 +82,8 @@ def _variables(path: str | Path, data: bytes, order: _Order) -> Iterator[tuple[s
                 raise ValueError("a matrix without flags, dimensions and name")
             yield parts[2][1].decode("latin-1"), content
     except (ValueError, zlib.error) as error:
+        if str(error).startswith(str(path)):
+            raise
         raise ValueError(f"{path}: truncated or damaged MATLAB file: {error}") from None
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxlocmap import files
 from jaxlocmap.logs.record import Log
 from jaxlocmap.logs.text import table
 
@@ -45,6 +46,11 @@ def read_mrclam(folder: str | Path, robot: int) -> Log:
         raise FileNotFoundError(f"{folder}: no such folder")
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected the folder of an MRCLAM data set, got a file")
+    with files.reading(folder, "an MRCLAM data set"):
+        return _read(folder, robot)
+
+
+def _read(folder: Path, robot: int) -> Log:
     matches = [re.match(r"Robot(\d+)_.*\.dat", path.name) for path in folder.iterdir()]
     robots = sorted({int(match[1]) for match in matches if match})
     if robot not in robots:
@@ -82,9 +88,11 @@ def read_mrclam(folder: str | Path, robot: int) -> Log:
     if not np.any(kept):
         raise ValueError(f"{seen_path}: no sighting of a landmark in {len(seen)} rows: dropped {counts}")
     try:
-        truth = table(_find(folder, f"Robot{robot}_Groundtruth.dat"), ("time", "x", "y", "heading"))
+        truth_path = _find(folder, f"Robot{robot}_Groundtruth.dat")
     except FileNotFoundError:
         truth = np.zeros((0, 4))
+    else:
+        truth = table(truth_path, ("time", "x", "y", "heading"))
     return Log(
         name=f"{folder.name} robot {robot}",
         landmarks=places[:, 1:3],
@@ -102,6 +110,6 @@ def read_mrclam(folder: str | Path, robot: int) -> Log:
 def _find(folder: Path, name: str) -> Path:
     """The file as it is, or else gzipped."""
     for path in (folder / name, folder / f"{name}.gz"):
-        if path.exists():
+        if path.exists() or path.is_symlink():  # a link to nothing is told and not passed over
             return path
     raise FileNotFoundError(f"{folder / name}: no such file, nor with .gz")

@@ -10,6 +10,7 @@ from dataclasses import field
 import numpy as np
 
 from jaxlocmap import checks
+from jaxlocmap.logs.text import LARGEST
 
 _NUMBERS = functools.partial(np.zeros, 0)
 _INTS = functools.partial(np.zeros, 0, np.int32)
@@ -29,8 +30,8 @@ class Log:
 
     Raises:
         ValueError: streams whose shapes do not belong together, a stamp or value that is not finite (`scan`
-            may hold NaN and infinity), a sighting of a row that `landmarks` does not have, or a maximum range
-            that is not positive.
+            may hold NaN and infinity) or larger than 1e12, a sighting of a row that `landmarks` does not have, or a
+            maximum range that is not positive.
     """
 
     name: str
@@ -74,6 +75,9 @@ class Log:
             checks.shape(name, value, shape)
             if name != "scan" and not np.all(np.isfinite(value)):
                 raise ValueError(f"{name}: expected finite values, got {np.sum(~np.isfinite(value))} others")
+            size = np.abs(value).max(initial=0) if name != "scan" else 0
+            if size > LARGEST:
+                raise ValueError(f"{name}: expected numbers of a size up to {LARGEST:g}, got {size:g}")
         if not self.scan_max_range > 0:
             raise ValueError(f"scan_max_range: expected metres > 0, got {self.scan_max_range}")
         rows = self.sighting_landmark

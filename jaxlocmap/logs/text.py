@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import codecs
-import gzip
 import math
-import zlib
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+
+from jaxlocmap import files
+
+# m, s or rad: nothing that a robot measures is larger, and the squares of what is are of no use.
+LARGEST = 1e12
+_LONGEST_LINE = 2**20  # bytes: a scan of 100,000 beams
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -17,19 +21,11 @@ def read_bytes(path: str | Path) -> bytes:
 
     Raises:
         FileNotFoundError: nothing at `path`.
-        ValueError: a folder, an empty file, or a truncated or damaged gzip.
+        ValueError: a folder, an empty file, a truncated or damaged gzip, or more than `files.most_bytes`.
     """
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file")
-    if not path.is_file():
-        raise ValueError(f"{path}: expected a file, got a folder or a device")
-    data = path.read_bytes()
+    data = files.read(path)
     if data.startswith(b"\x1f\x8b"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
-            raise ValueError(f"{path}: truncated or damaged gzip: {error}") from None
+        data = files.unzipped(path, data)
     if not data:
         raise ValueError(f"{path}: the file is empty")
     return data
@@ -41,7 +37,8 @@ def lines(path: str | Path) -> Iterator[tuple[int, str]]:
     Byte-order marks are no part of a line; UTF-16 text with one is read like any other.
 
     Raises:
-        FileNotFoundError, ValueError: as `read_bytes`; ValueError also for a file with zero bytes in it.
+        FileNotFoundError, ValueError: as `read_bytes`; ValueError also for a file with zero bytes in it, and for a line
+            of more than a mebibyte.
     """
     data = read_bytes(path)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -50,6 +47,8 @@ def lines(path: str | Path) -> Iterator[tuple[int, str]]:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
         raise ValueError(f"{path}:{line}: expected text, got binary data")
     for number, raw in enumerate(data.splitlines(), 1):
+        if len(raw) > _LONGEST_LINE:
+            raise ValueError(f"{path}:{number}: expected lines of at most {_LONGEST_LINE:,} bytes, got {len(raw):,}")
         # Latin-1 takes any byte: old logs have comments in unknown encodings, and numbers are ASCII.
         line = raw.removeprefix(codecs.BOM_UTF8).decode("latin-1").strip()
         if line and not line.startswith("#"):
@@ -60,8 +59,8 @@ def numbers(fields: Sequence[str], names: Sequence[str], where: str, *, finite: 
     """Parse as many fields as names.
 
     Raises:
-        ValueError: another number of fields, or one that is no number or (with `finite`) not finite; the
-            message starts with `where` and gives the column's name.
+        ValueError: another number of fields, or one that is no number or (with `finite`) not finite or larger
+            than 1e12 in size; the message starts with `where` and gives the column's name.
     """
     if len(fields) != len(names):
         listed = ", ".join(names if len(names) <= 10 else [*names[:3], "...", names[-1]])
@@ -76,6 +75,9 @@ def _number(name: str, field: str, where: str, finite: bool) -> float:
         value = None
     if value is None or (finite and not math.isfinite(value)):
         kind = "a finite number" if finite else "a number"
+        raise ValueError(f"{where}: {name}: expected {kind}, got {field[:40]!r}")
+    if finite and abs(value) > LARGEST:
+        kind = f"a number of a size up to {LARGEST:g}"
         raise ValueError(f"{where}: {name}: expected {kind}, got {field[:40]!r}")
     return value
 
@@ -111,7 +113,7 @@ def table(path: str | Path, names: Sequence[str], *, integer: Collection[str] = 
         for name, value in zip(names, row, strict=True):
             if name in integer and not value.is_integer():
                 raise ValueError(f"{where}: {name}: expected a whole number, got {value}")
-        rows.append(row)
+        rows.append(np.array(row))
     if not rows:
         raise ValueError(f"{path}: no rows of {', '.join(names)}: only blank lines and comments")
     return np.array(rows, np.float64)

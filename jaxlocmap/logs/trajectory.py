@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxlocmap import files
 from jaxlocmap.logs.text import lines, numbers
 from jaxlocmap.logs.timeline import backward, check_overlap, interpolate, last_at_each_stamp
 
@@ -61,6 +62,11 @@ def read_trajectory(path: str | Path) -> Trajectory:
 
     Source: Sturm et al. 2012 (TUM); ROS geometry_msgs/PoseWithCovariance.
     """
+    with files.reading(path, "poses"):
+        return _read(path)
+
+
+def _read(path: str | Path) -> Trajectory:
     rows = list(lines(path))
     if not rows:
         raise ValueError(f"{path}: expected poses, got only blank lines and comments")
@@ -132,6 +138,11 @@ def read_innovations(path: str | Path, stamps: np.ndarray) -> dict[str, np.ndarr
     Raises:
         FileNotFoundError, ValueError: as `read_trajectory`; ValueError also for an observation before the first stamp.
     """
+    with files.reading(path, "innovations"):
+        return _innovations(path, stamps)
+
+
+def _innovations(path: str | Path, stamps: np.ndarray) -> dict[str, np.ndarray]:
     rows = list(lines(path))
     if len(rows) < 2:
         raise ValueError(f"{path}: expected a line of names and innovations, got {len(rows)} lines")
@@ -219,7 +230,7 @@ def _parsed(
     for number, line in rows:
         where = f"{path}:{number}"
         fields = [field.strip() for field in line.split(separator)]
-        values.append(numbers(fields, names, where, finite=False))
+        values.append(np.array(numbers(fields, names, where, finite=False)))
         stamp = values[-1][names.index("t")]
         if not np.isfinite(stamp):
             raise ValueError(f"{where}: t: expected a finite stamp, got {stamp}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxlocmap import checks
+from jaxlocmap import checks, files
 
 
 def write_tum(path: str | Path, time: ArrayLike, pose: ArrayLike) -> None:
@@ -39,4 +39,4 @@ def write_tum(path: str | Path, time: ArrayLike, pose: ArrayLike) -> None:
     zero, half = np.zeros(len(time)), pose[:, 2] / 2
     columns = (time, pose[:, 0], pose[:, 1], zero, zero, zero, np.sin(half), np.cos(half))
     rows = np.column_stack(columns).tolist()
-    Path(path).write_text("".join(" ".join(map(repr, row)) + "\n" for row in rows))
+    files.write(path, "".join(" ".join(map(repr, row)) + "\n" for row in rows))

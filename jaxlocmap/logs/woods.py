@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxlocmap import files
 from jaxlocmap.logs.matlab import read_matrices
 from jaxlocmap.logs.record import Log
 
@@ -34,12 +35,16 @@ def read_woods(path: str | Path) -> Log:
     Raises:
         FileNotFoundError: nothing at `path`.
         ValueError: no MATLAB file of version 5 to 7, a truncated or damaged one, a variable that is missing,
-            of another shape, not numeric or not finite, or stamps that do not increase; the message starts
-            with the path.
+            of another shape, not numeric or not finite, a variance that is not positive, or stamps that do not
+            increase; the message starts with the path.
 
     Source: T. D. Barfoot, University of Toronto Institute for Aerospace Studies (UTIAS), 2009.
     """
-    fields = read_matrices(path, (*_VECTORS, "l", "r", "b", *_SCALARS))
+    with files.reading(path, "a log in the form of lost in the woods"):
+        return _log(path, read_matrices(path, (*_VECTORS, "l", "r", "b", *_SCALARS)))
+
+
+def _log(path: str | Path, fields: dict[str, np.ndarray]) -> Log:
     stamps = fields["t"].size
     steps, landmarks = max(stamps, 2), fields["l"].shape[0]
     shapes = dict.fromkeys(_VECTORS, (steps, 1)) | dict.fromkeys(_SCALARS, (1, 1))
@@ -57,6 +62,9 @@ def read_woods(path: str | Path) -> Log:
     valid = fields["true_valid"][:, 0] != 0
     pose = np.hstack([fields["x_true"], fields["y_true"], fields["th_true"]])
     scalar = {name: float(fields[name][0, 0]) for name in _SCALARS}
+    for name in _SCALARS[1:]:
+        if not scalar[name] > 0:
+            raise ValueError(f"{path}: {name}: expected a variance > 0, got {scalar[name]}")
     return Log(
         name=Path(path).name,
         landmarks=fields["l"],

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from jaxlocmap.consistency import chi2_quantile
-from jaxlocmap.plotting.style import ESTIMATE, EXPECTED, TRUTH
+from jaxlocmap.plotting.style import ESTIMATE, EXPECTED, TRUTH, save
 from jaxlocmap.types import GridSpec
 
 
@@ -56,7 +56,7 @@ def trajectory_figure(
     ax.set(xlabel="x [m]", ylabel="y [m]", title=title)
     ax.set_aspect("equal", adjustable="datalim")  # a straight drive would leave no height
     figure.legend(fontsize=8, loc="outside lower center", ncols=5)
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def map_figure(
@@ -93,7 +93,7 @@ def map_figure(
         ax.set_ylim(*_limits(seen_rows, margin, y, spec.resolution, rows))
     ax.set(xlabel="x [m]", ylabel="y [m]", title=title)
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)
-    figure.savefig(path, dpi=150)
+    save(figure, path, dpi=150)
 
 
 def _limits(cells: np.ndarray, margin: float, origin: float, resolution: float, count: int) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
 from jaxlocmap.consistency import COVERAGE_LEVELS, readable
-from jaxlocmap.plotting.style import BAND, ESTIMATE, EXPECTED, TRUTH, from_zero
+from jaxlocmap.plotting.style import BAND, ESTIMATE, EXPECTED, TRUTH, from_zero, save
 
 _BEYOND = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
 
@@ -52,7 +52,7 @@ def study_figure(path: Path, report: dict[str, Any], dt: float) -> None:
     named = [report["scenario"]] if "scenario" in report else []
     named += [f"{report['motion']} motion"] if "motion" in report else []
     _title(figure, ", ".join([*named, f"{runs} runs"]), report["verdict"])
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def judge_figure(path: Path, report: dict[str, Any], where: np.ndarray, title: str = "") -> None:
@@ -92,7 +92,7 @@ def judge_figure(path: Path, report: dict[str, Any], where: np.ndarray, title: s
     ax.set(title="Where", xlabel="x [m]", ylabel="y [m]")
     ax.set_aspect("equal", adjustable="datalim")  # a straight drive would leave no height
     _title(figure, title, report["verdict"])
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def _title(figure: Figure, title: str, verdict: str) -> None:
@@ -141,7 +141,7 @@ def precision_figure(path: Path, rows: list[dict[str, Any]]) -> None:
     from_zero(left)
     right.legend(fontsize=8)
     figure.suptitle(rows[-1]["verdict"].replace("; ", "\n"), fontsize=11)
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def sweep_figure(path: Path, report: dict[str, Any], labels: tuple[str, str], ticks: tuple[list[str], ...]) -> None:
@@ -182,7 +182,7 @@ def sweep_figure(path: Path, report: dict[str, Any], labels: tuple[str, str], ti
     title = f"{report['scenario']}, {report['motion']} motion, {report['runs']} runs a cell"
     words = [report[name] for name in ("gate_verdict", "verdict") if name in report]
     figure.suptitle("\n".join([title, *words]), fontsize=11)
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def _finite(values: np.ndarray) -> np.ndarray:

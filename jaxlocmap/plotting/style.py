@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jaxlocmap import files
 
 TRUTH, ESTIMATE, BAND, EXPECTED = "0.25", "tab:blue", "tab:green", "tab:orange"
 
@@ -12,3 +17,9 @@ def from_zero(ax: Axes) -> None:
     ax.set_ylim(bottom=0)
     ax.margins(y=0.2)
     ax.legend(fontsize=8)
+
+
+def save(figure: Figure, path: Path, dpi: int) -> None:
+    """Write the picture in one piece."""
+    with files.writing(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxlocmap.consistency import chi2_quantile, readable
-from jaxlocmap.plotting.style import BAND, ESTIMATE, EXPECTED, TRUTH, from_zero
+from jaxlocmap.plotting.style import BAND, ESTIMATE, EXPECTED, TRUTH, from_zero, save
 
 _BEFORE, _AFTER = EXPECTED, ESTIMATE
 
@@ -44,7 +44,7 @@ def descent_figure(path: Path, report: dict[str, Any]) -> None:
     right.semilogy(step, np.maximum(trace["gradient_norm"], 1e-16), ".-", color=ESTIMATE)
     right.set(title="Norm of the gradient by the coordinates", xlabel="step", ylabel="norm [per unit of the logarithm]")
     figure.suptitle(f"{report['source']}: {report['evaluations']} evaluations in {report['run_s']:.1f} s", fontsize=11)
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def study_before_after_figure(path: Path, before: dict[str, Any], after: dict[str, Any], dt: float) -> None:
@@ -60,7 +60,7 @@ def study_before_after_figure(path: Path, before: dict[str, Any], after: dict[st
     from_zero(left)
     _coverage(right, before, after)
     figure.suptitle(f"before: {before['verdict']}\nafter: {after['verdict']}", fontsize=10)
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def log_before_after_figure(path: Path, drives: dict[str, dict[str, Any]]) -> None:
@@ -83,7 +83,7 @@ def log_before_after_figure(path: Path, drives: dict[str, dict[str, Any]]) -> No
         left.set(title=f"{name}, held out", xlabel="time [s]", ylabel="NEES [–]", yscale="log")
         left.legend(fontsize=8, loc="lower right")
         _coverage(right, drive["before"], drive["after"])
-    figure.savefig(path, dpi=110)
+    save(figure, path, dpi=110)
 
 
 def calibration_figure(path: Path, before: dict[str, Any], after: dict[str, Any], what: str) -> None:
@@ -111,7 +111,7 @@ def calibration_figure(path: Path, before: dict[str, Any], after: dict[str, Any]
     )
     left.legend(fontsize=8)
     right.legend(fontsize=8)
-    figure.savefig(path, dpi=120)
+    save(figure, path, dpi=120)
 
 
 def _coverage(ax: Axes, before: dict[str, Any], after: dict[str, Any]) -> None:
