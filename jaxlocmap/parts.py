@@ -145,6 +145,7 @@ class Parts:
         if self._lock is None:
             Lock.check(self._lock_file())
         found, asked = self._found(), self._asked(manifest)
+        self._check_foreign(found)
         if found is None:
             self._check_damage()
             return
@@ -158,15 +159,19 @@ class Parts:
             differences = "; ".join(f"{name} was {found.get(name)!r}, is {asked.get(name)!r}" for name in names)
             raise ValueError(f"resume: expected the study that {self.folder} belongs to, got another: {differences}")
 
-    def _check_damage(self) -> None:
-        """Raise where there is no manifest to go by and something that may be lost."""
-        there, manifest = self._part_files(), self.folder / _MANIFEST
-        foreign = [file for file in there if not _is_part(file)]
-        if manifest.exists() and not _may_be_manifest(manifest):
+    def _check_foreign(self, found: Mapping[str, Any] | None) -> None:
+        """Raise where a file stands in a study's way that neither its manifest names nor a study has written."""
+        named, manifest = self._named(found), self.folder / _MANIFEST
+        foreign = [file for file in self._part_files() if file not in named and not _is_part(file)]
+        if found is None and manifest.exists() and not _may_be_manifest(manifest):
             foreign.append(manifest)
         if foreign:
             names = ", ".join(file.name for file in foreign[:3])
             raise ValueError(f"parts: expected a study's files in {self.folder}, got others: {names}; none was touched")
+
+    def _check_damage(self) -> None:
+        """Raise where there is no manifest to go by and something that may be lost."""
+        there, manifest = self._part_files(), self.folder / _MANIFEST
         if (there or manifest.exists()) and not self.discard:
             what = "damaged" if manifest.exists() else "missing"
             raise ValueError(
@@ -249,8 +254,7 @@ class Parts:
         found = self._found()
         if found is not None:
             self._lock = self._lock or Lock(self._lock_file())
-            names = [_name(part) for part in range(self._split(found).parts)]
-            self._remove([*(self.folder / name for name in names), self.folder / _MANIFEST])
+            self._remove([*self._named(found), self.folder / _MANIFEST])
             self.release()
             for file in self.folder.glob(f"{_LOCK}*"):  # of processes that were killed
                 with contextlib.suppress(OSError):
@@ -291,8 +295,11 @@ class Parts:
             self.say(f"discarding {runs:,} finished runs in {self.folder}")
         elif found is None and (parts := self._part_files()):
             self.say(f"discarding {len(parts):,} finished parts in {self.folder}")
-        names = [] if found is None else [_name(part) for part in range(self._split(found).parts)]
-        self._remove([*self._part_files(), *(self.folder / name for name in names), self.folder / _MANIFEST])
+        self._remove([*self._part_files(), *self._named(found), self.folder / _MANIFEST])
+
+    def _named(self, manifest: Mapping[str, Any] | None) -> list[Path]:
+        """The files of all parts of a study, there or not; none without a manifest."""
+        return [] if manifest is None else [self.folder / _name(part) for part in range(self._split(manifest).parts)]
 
     def _part_files(self) -> list[Path]:
         """Files that are named like parts."""

@@ -1,6 +1,5 @@
 """Files are written whole or not at all, read within limits, and every fault names its file."""
 
-import contextlib
 import gzip
 import json
 import os
@@ -10,22 +9,12 @@ import zlib
 
 import numpy as np
 import pytest
+from disks import full_disk
 
 from jaxlocmap import Params, files, logs
 from jaxlocmap.logs import matlab
 
 PARAMS = Params.from_std(v=0.1, w=0.1, range=0.1, bearing=0.1)
-
-
-@contextlib.contextmanager
-def full_disk():
-    """No file may grow beyond 10 bytes."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize(
@@ -39,7 +28,7 @@ def full_disk():
 def test_a_full_disk_leaves_what_was_there(tmp_path, name, write):
     path = tmp_path / name
     path.write_text("before")
-    with full_disk(), pytest.raises(OSError, match="File too large"):
+    with full_disk(room=10), pytest.raises(OSError, match="File too large"):
         write(path)
     assert [file.name for file in tmp_path.iterdir()] == [name]
     assert path.read_text() == "before"

@@ -5,7 +5,6 @@ import itertools
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from disks import full_disk
 
 from jaxlocmap import chunks
 from jaxlocmap import parts as parts_module
@@ -193,6 +193,15 @@ def test_a_user_s_own_files_are_refused_and_stay(folder, name, flags):
     assert (folder / name).read_text() == '{"name": "my data"}'
 
 
+@pytest.mark.parametrize("flags", [{"resume": True}, {"discard": True}, {"discard": False}])
+def test_a_file_that_a_good_manifest_does_not_name_is_refused_and_stays(folder, flags):
+    opened(folder)  # of 8 parts
+    (folder / "part-200").write_text("mine")
+    with pytest.raises(ValueError, match="got others: part-200; none was touched"):
+        opened(folder, **flags)
+    assert (folder / "part-200").read_text() == "mine"
+
+
 def test_what_is_beside_a_study_s_files_stays_to_the_end(folder):
     """Names that begin as a study's do, in the folder of the report and in its own."""
     names = ["part-list.csv", "part-000.stl", "part-time-job.txt", "manifest.json.bak", "part-200", "manifest.json"]
@@ -289,17 +298,6 @@ def test_clearing_leaves_what_is_not_the_study_s(folder):
     (folder / "notes.txt").write_text("mine")
     parts.clear()
     assert [file.name for file in folder.iterdir()] == ["notes.txt"]
-
-
-@contextlib.contextmanager
-def full_disk():
-    """No file may grow beyond 100 bytes."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_a_full_disk_is_told_and_keeps_what_is_kept(folder):
