@@ -87,6 +87,8 @@ def start(config: ComputeConfig) -> None:
     platform = jax.devices()[0].platform
     others = f" in each of {jax.process_count()} processes" if jax.process_count() > 1 else ""
     CONSOLE.print(f"computing on {devices} {platform} device(s){others}; compiling takes some seconds")
+    if others:
+        CONSOLE.print("if one of them dies, JAX aborts all with a C++ stack: what they finished is kept, see --resume")
 
 
 def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -> Parts:

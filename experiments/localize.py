@@ -136,11 +136,12 @@ def prior_at(pose: np.ndarray) -> Gaussian:
 
 
 def first_pose(log: Log, timeline: Timeline) -> np.ndarray:
-    if not timeline.truth_valid[0]:
+    first = np.searchsorted(timeline.time, timeline.time[0], side="right") - 1  # the last step at the first stamp
+    if not timeline.truth_valid[first]:
         raise ValueError(
             f"start: {log.name} has no truth at its first step, {timeline.time[0]:.3f} s: expected a pose X Y THETA"
         )
-    return timeline.truth[0]
+    return timeline.truth[first]
 
 
 def offset_of(offset: np.ndarray) -> tuple[float, float, float]:
@@ -218,7 +219,8 @@ def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str,
 
 def _write(out: Path, log: Log, timeline: Timeline, info: Info, report: dict[str, Any]) -> None:
     write_report(out, report)
-    write_tum(out / "estimate.tum", timeline.time, info.belief.mean)
+    last = np.append(np.diff(timeline.time) > 0, True)  # of the steps at one stamp
+    write_tum(out / "estimate.tum", timeline.time[last], info.belief.mean[last])
     files = ["report.json", "trajectory.png", "estimate.tum"]
     known = timeline.truth_valid
     judged = report["scored_steps"] > 0

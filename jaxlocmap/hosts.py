@@ -99,8 +99,9 @@ def join(
     Every process runs the same program. What is not given, JAX takes from the cluster it finds itself in (Slurm,
     Kubernetes, Open MPI). Call it before anything else touches JAX, and start the first study soon after: JAX gives
     up on a process that comes 30 s after the first one to what they do first together, and on one that comes half an
-    hour later than the others to the end. When a process dies, JAX ends the others within two minutes, and not
-    gracefully. Once joined, a process stays so: another call does nothing.
+    hour later than the others to the end. When a process dies, JAX aborts the others with a C++ stack on the screen, at
+    once if it was process 0, else within two minutes; what is on disk stays. Once joined, a process stays so: another
+    call does nothing.
 
     Args:
         coordinator: "host:port" of process 0. It listens at that address alone if it is given as a number

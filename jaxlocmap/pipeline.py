@@ -19,6 +19,9 @@ from jaxlocmap.batching import any_in_batch, cond, scan, zero_like_any
 from jaxlocmap.stages import Sighting, correct, is_measurement, map_scan, map_spec, predict, sound
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
 
+# rad², of a heading that is uniform on the circle.
+_UNKNOWN_HEADING = np.pi**2 / 3
+
 
 def init(prior: Gaussian, *, config: Config) -> State:
     """The state before the first step: the prior is the pose at step -1, and the map knows nothing.
@@ -29,8 +32,8 @@ def init(prior: Gaussian, *, config: Config) -> State:
 
     Raises:
         ValueError: wrong shapes; a grid so far out that the dtype cannot hold its corners to a millimetre; or, when
-            they can be looked at, a mean that is not finite or as far out, or a covariance that is not positive
-            semi-definite.
+            they can be looked at, a mean that is not finite or as far out, a covariance that is not positive
+            semi-definite, or in float32 a heading variance above π²/3 rad², that of a heading nobody knows.
         TypeError: a prior that is not floating point.
     """
     mean, cov = (jnp.asarray(x) for x in prior)
@@ -41,6 +44,13 @@ def init(prior: Gaussian, *, config: Config) -> State:
         raise ValueError(f"prior.mean: expected finite x, y, theta, got {mean.tolist()}")
     checks.resolved("prior.mean", mean[:2], mean.dtype)
     checks.covariance("prior.cov", cov, 3)
+    heading = np.asarray(cov)[2, 2] if checks.is_concrete(cov) else 0
+    if mean.dtype != np.float64 and heading > _UNKNOWN_HEADING:
+        raise ValueError(
+            f"prior.cov: expected a heading variance up to {_UNKNOWN_HEADING:.3g} rad², that of a heading nobody "
+            f"knows, got {heading:.4g}: in {mean.dtype} the first correction would leave no covariance; give "
+            "that much, or use float64 (jax.config.update('jax_enable_x64', True))"
+        )
     if config.grid is not None:
         checks.resolved("config.grid", grid.corners(config.grid), mean.dtype)
     return State(

@@ -297,6 +297,17 @@ def test_arrays_that_do_not_belong_together_are_refused(change, message):
         judge(given.pop("truth"), given.pop("mean"), given.pop("cov"), **given)
 
 
+def test_a_step_that_is_missing_in_every_run_may_share_its_stamp_with_the_next():
+    arrays = np.full((2, 4, 3), 0.1), np.zeros((2, 4, 3)), np.tile(np.eye(3), (2, 4, 1, 1))
+    valid = np.array([[True, False, True, True]] * 2)
+    report = judge(*arrays, time=[0.0, 1.0, 1.0, 2.0], valid=valid)
+    assert (report["scored_steps"], report["counts"]["missing"]) == (6, 2)
+    assert report["anees"] == pytest.approx(0.03, rel=1e-12)
+    for time, seen in (([0, 1, 1, 2], ~valid), ([0, 1, 0.5, 2], valid), ([0, 1, math.nan, 2], valid)):
+        with pytest.raises(ValueError, match="time: expected increasing stamps, got"):
+            judge(*arrays, time=time, valid=seen)
+
+
 # --- Files ---
 
 COLUMNS = ("t", "x", "y", "theta", "xx", "xy", "xt", "yy", "yt", "tt")

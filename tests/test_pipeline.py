@@ -901,6 +901,18 @@ def test_a_prior_that_cannot_be_is_refused(field, value, error, message, course)
         init(course.prior._replace(**{field: value}), config=Config())
 
 
+def test_in_float32_a_heading_is_known_no_less_than_not_at_all(course):
+    def start(variance, dtype):
+        prior = Gaussian(jnp.zeros(3, dtype), jnp.diag(jnp.array([1e4, 1e4, variance], dtype)))
+        return init(prior, config=Config())
+
+    start(np.pi**2 / 3 * 0.999, jnp.float32)
+    with pytest.raises(ValueError, match=r"prior\.cov: expected a heading variance up to 3.29 rad².*got 1e\+04"):
+        start(1e4, jnp.float32)
+    if jax.config.jax_enable_x64:
+        start(1e4, jnp.float64)
+
+
 def test_a_prior_without_uncertainty_is_fine(course):
     state = init(course.prior._replace(cov=jnp.zeros((3, 3))), config=Config())
     assert state.log_odds is None

@@ -1,15 +1,18 @@
 """Pauses, clocks that differ and stamps that fold: what becomes of time between the streams of a log."""
 
+import dataclasses
 import math
 import os
 import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import logs
+from jaxlocmap import Config, Gaussian, Params, init, logs, run
+from jaxlocmap.logs import timeline
 
 
 def log_of(odometry, sightings=(), truth=(), scans=()):
@@ -121,23 +124,100 @@ def test_streams_that_touch_overlap():
     assert logs.to_timeline(log_of(DRIVE, truth=[-1, 0])).truth_valid.sum() == 1
 
 
+# --- Many sightings at one stamp ---
+
+
+def crowd(seen):
+    """So many sightings at each stamp, of ranges 1, 2, 3 ... in order, and a scan and truth at every stamp."""
+    stamps = np.arange(len(seen), dtype=float)
+    log = log_of([(t, 1 + t, 0) for t in stamps], np.repeat(stamps, seen), truth=stamps, scans=stamps)
+    sighting = np.column_stack([1 + np.arange(sum(seen)), np.zeros(sum(seen))])
+    return dataclasses.replace(log, sighting=sighting.astype(float))
+
+
+def test_a_crowd_at_one_stamp_takes_several_steps_of_no_length_and_little_memory():
+    seen = [0, 1, 2, 3000, 0, 1, *[0] * 2000]
+    log = crowd(seen)
+    timeline = logs.to_timeline(log)
+    time, inputs = timeline.time, timeline.inputs
+    assert inputs.z.nbytes < 200_000  # a table with 3,000 slots would be of 96 MB
+    # What is there is what was there, in order; what a stamp sees comes before anything moves on.
+    assert (inputs.dt.sum(), inputs.dt.min(), inputs.dt[0]) == (len(seen) - 1, 0, 0)
+    np.testing.assert_array_equal(np.cumsum(inputs.dt), time)
+    np.testing.assert_array_equal(inputs.z[inputs.valid][:, 0], 1 + np.arange(sum(seen)))
+    step, _ = np.nonzero(inputs.valid)
+    np.testing.assert_array_equal(time[step], log.sighting_time)
+    moves = inputs.dt > 0
+    np.testing.assert_array_equal(inputs.control[moves, 0], 1 + np.arange(len(seen) - 1))
+    # The scan and the truth belong to the pose that has seen all.
+    last = np.append(np.diff(time) > 0, True)
+    np.testing.assert_array_equal(np.isfinite(inputs.ranges[:, 0]), last)
+    np.testing.assert_array_equal(timeline.truth_valid, last)
+    np.testing.assert_array_equal(np.isfinite(timeline.truth[:, 0]), last)
+    assert timeline.counts["truth_gaps"] == 0
+
+
+def test_several_steps_of_a_stamp_give_the_belief_of_one(monkeypatch):
+    log = crowd([0] * 200 + [40] + [0] * 200)
+    log = dataclasses.replace(log, landmarks=np.array([[3.0, 2.0]]), sighting=log.sighting * [0.1, 0] + [1, 0.5])
+    config, params = Config(dt=1.0), Params.from_std(v=0.1, w=0.1, range=0.5, bearing=0.5)
+    prior = Gaussian(jnp.zeros(3), jnp.eye(3) * 0.1)
+
+    def believed():
+        inputs = logs.to_timeline(log).inputs._replace(ranges=None)
+        inputs = jax.tree.map(lambda x: jnp.asarray(x, jnp.int32 if x.dtype == np.int32 else None), inputs)
+        landmarks = jnp.asarray(log.landmarks)
+        state, _ = jax.jit(
+            lambda: run(params, init(prior, config=config), inputs, landmarks=landmarks, config=config)
+        )()
+        return inputs.valid.shape, state.belief
+
+    (steps, slots), belief = believed()
+    assert (steps, slots) == (440, 1)
+    monkeypatch.setattr(timeline, "_WORTH", math.inf)
+    shape, expected = believed()
+    assert shape == (401, 40)
+    jax.tree.map(
+        lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4 if x.dtype == jnp.float32 else 1e-11), belief, expected
+    )
+
+
+@pytest.mark.parametrize("seen", [[0, 3, 5, 1] * 9, [40] * 5, [0] * 30 + [7]])
+def test_a_table_that_is_well_used_keeps_a_step_for_every_stamp(seen):
+    timeline = logs.to_timeline(crowd(seen))
+    assert timeline.inputs.valid.shape == (len(seen), max(seen))
+    np.testing.assert_array_equal(timeline.inputs.z[timeline.inputs.valid][:, 0], 1 + np.arange(sum(seen)))
+    assert np.all(np.diff(timeline.time) > 0)
+
+
+def test_a_log_that_starts_in_a_crowd_starts_at_its_truth(programs):
+    timeline = logs.to_timeline(crowd([4000, *[0] * 2000]))
+    np.testing.assert_array_equal(programs.first_pose(crowd([1]), timeline), np.zeros(3))
+
+
 # --- Small logs on disk ---
 
 
 @pytest.fixture(scope="module")
-def localized(tmp_path_factory):
+def programs():
+    sys.path.append(str(Path(__file__).parent.parent / "experiments"))
+    import localize
+
+    return localize
+
+
+@pytest.fixture(scope="module")
+def localized(tmp_path_factory, programs):
     """Runs the program on a case, in this process, and keeps its report."""
     root = os.environ.get("JAXLOCMAP_DATA")
     if not root:
         pytest.skip("JAXLOCMAP_DATA does not name a folder with the real logs")
-    sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-    import localize
 
     def report(case, **settings):
         folder = Path(root).parent / "cases" / case
         with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
             out = tmp_path_factory.mktemp("out")
-            return localize.main(localize.LocalizeConfig(folder, "mrclam", robot=1, out=out, **settings))
+            return programs.main(programs.LocalizeConfig(folder, "mrclam", robot=1, out=out, **settings))
 
     return report
 

@@ -4,14 +4,19 @@ import json
 import math
 import os
 import re
+import signal
 import sys
+import threading
+import time
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from test_experiments import is_png
 
-from jaxlocmap import Params
+from jaxlocmap import Config, Params, simulate, tuning
+from jaxlocmap.tuning.fit import Trace
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import tune
@@ -52,6 +57,35 @@ def test_simulated_drives(tmp_path):
     assert float(best.R[0, 0]) ** 0.5 == pytest.approx(report["parameters"]["range"]["end"], rel=1e-6)
     assert is_png(tmp_path / "descent.png")
     assert is_png(tmp_path / "nees.png")
+
+
+def test_ctrl_c_while_judging_stops_at_once_and_says_what_is_kept(monkeypatch, tmp_path):
+    trace = Trace(*np.zeros((4, 4)), params={"range": np.ones(4)})
+    found = tuning.Fit(simulate.own_params(simulate.Noise(), 0.1), 1.0, np.ones(3), trace, 0, False, 0.0, 0.0)
+    source = tune.Source("made", found.params, Config(dt=0.1), *[None] * 3, None, 0.1)
+    monkeypatch.setattr(tune, "_source", lambda *_: source)
+
+    def fit(*_, progress, **__):
+        progress(found)
+        return found
+
+    def certainty(*_):
+        threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
+        working_in.append(threading.current_thread())
+        time.sleep(5)
+
+    monkeypatch.setattr(tune.tuning, "fit", fit)
+    monkeypatch.setattr(tune.tuning, "certainty", certainty)
+    working_in, began = [], time.monotonic()
+    with pytest.raises(KeyboardInterrupt) as stopped:
+        tuned(tmp_path, tune=("range",))
+    assert time.monotonic() - began < 4
+    assert working_in != [threading.main_thread()]  # where Ctrl-C is not heard while JAX compiles
+    params, report = tmp_path / "params.json", tmp_path / "report.json"
+    kept = f"the best of 2 epochs is kept in {params}, from which --params goes on, and the descent in {report}"
+    assert stopped.value.args == (kept,)
+    assert Params.load(params).check() is None
+    assert "trace" in json.loads(report.read_text())
 
 
 @pytest.mark.parametrize(

@@ -46,7 +46,8 @@ def judge(
         truth: (N, T, 3) or (T, 3) m, m, rad; or as long as `mean`, of which `pose` then chooses too.
         mean: (N, T, n) or (T, n), the estimate, n >= 3.
         cov: (N, T, n, n) or (T, n, n), its covariance.
-        time: (T,) s, for the words and figures; the steps' numbers by default.
+        time: (T,) s, for the words and figures; the steps' numbers by default. A step that is missing in every run may
+            share its stamp with the next.
         valid: (N, T) or (T,) bool, False where a step is missing; those that are not finite are missing too.
         pose: which entries of the state are x, y and the heading.
         innovations: for NIS, whiteness and gate; none by default.
@@ -68,8 +69,9 @@ def judge(
     runs, steps = valid.shape
     stamps = np.arange(steps, dtype=float) if time is None else np.asarray(time, np.float64)
     checks.shape("time", stamps, (steps,))
-    if not np.all(np.diff(stamps) > 0):
-        raise ValueError(f"time: expected increasing stamps, got {np.sum(~(np.diff(stamps) > 0))} that do not")
+    later = np.diff(stamps) > 0
+    if not np.all(later | ((np.diff(stamps) == 0) & ~valid[:, :-1].any(0))):
+        raise ValueError(f"time: expected increasing stamps, got {np.sum(~later)} that do not")
 
     known = valid & np.isfinite(truth).all(-1)
     finite = known & np.isfinite(mean).all(-1) & np.isfinite(cov).all((-1, -2))

@@ -13,15 +13,17 @@ from jaxlocmap.types import Inputs
 # s. Robots drive on through pauses of their loggers: of the pauses of 0.7 to 1 s in MRCLAM's dataset 6, with stamps
 # usually 0.01 s apart and a robot under way, it went on in 94 %. None exceeds 1.4 s.
 MAX_GAP = 1.5
+# As many times less room must a table of fewer slots take to be worth further steps.
+_WORTH = 8
 
 
 class Timeline(NamedTuple):
     """A log as steps, float64 NumPy. The prior of a filter is the belief at `time[0]`, since `dt[0]` is 0."""
 
-    time: np.ndarray  # (T,) s, strictly increasing
+    time: np.ndarray  # (T,) s, increasing; steps that share the sightings of one stamp have the same
     inputs: Inputs  # of NumPy arrays; `ranges` (T, B) m, inf: no return, NaN: no measurement, or no scan at this step
     truth: np.ndarray  # (T, 3) m, m, rad at `time`, heading in [-pi, pi); NaN where not `truth_valid`
-    truth_valid: np.ndarray  # (T,) bool
+    truth_valid: np.ndarray  # (T,) bool; of the steps at one stamp only the last, which has seen all
     counts: dict[str, float]  # what the reader and `to_timeline` dropped or repaired: how often, gaps also in s
 
 
@@ -41,7 +43,9 @@ def to_timeline(
     after its last stamp, the command holds for the usual period of the log (the median of its intervals); then the
     robot stands: a step of its own begins there, and the command is (0, 0) up to the next one, so that the covariance
     grows by Q as in any other step. The number of slots M is the largest number of sightings at one stamp, at least 1;
-    unused slots hold landmark 0, z 0, valid False.
+    unused slots hold landmark 0, z 0, valid False. Where that would
+    be a table of mostly unused slots (one stamp with thousands of sightings), M is smaller and such a stamp has several
+    steps, `dt` 0 from the second on and the scan in the last, which comes to the same.
 
     The counts of the log are joined by: `backward_stamps` (stamps of odometry, sightings and scans below the
     one before; sorted, ties in file order), `backward_truth` (the same for truth), `duplicate_odometry`,
@@ -99,6 +103,7 @@ def to_timeline(
     if not len(time):
         raise ValueError(f"{log.name}: no step between start {start} and stop {stop}")
     sighting_rows = sighting_rows[(seen >= time[0]) & (seen <= time[-1])]
+    time, slots = _spread(time, log.sighting_time[sighting_rows])
     scan_rows = scan_rows[(scanned >= time[0]) & (scanned <= time[-1])]
 
     previous = np.concatenate([time[:1], time[:-1]])
@@ -108,11 +113,11 @@ def to_timeline(
     stood = stands & (time > previous)
     counts["odometry_gaps"] = len(np.unique(in_force[stood]))
     counts["odometry_gap_seconds"] = round(float(np.sum((time - previous)[stood])), 3)
-    landmark, z, valid = _slots(log, sighting_rows, time)
+    landmark, z, valid = _fill(log, sighting_rows, time, slots)
     ranges = None
     if len(log.scan_time):
         ranges = np.full((len(time), log.scan.shape[1]), np.nan)
-        ranges[np.searchsorted(time, log.scan_time[scan_rows])] = log.scan[scan_rows]
+        ranges[np.searchsorted(time, log.scan_time[scan_rows], side="right") - 1] = log.scan[scan_rows]
     arrays: tuple[Any, ...] = (time - previous, control, landmark, z, valid, ranges)
     counts["backward_truth"] = backward(log.truth_time)
     truth_rows = last_at_each_stamp(log.truth_time)
@@ -121,6 +126,9 @@ def to_timeline(
     truth, truth_valid = interpolate(truth_time, log.truth[truth_rows], time, max_gap)
     after = np.searchsorted(truth_time, time[~truth_valid])
     counts["truth_gaps"] = len(np.unique(after[(after > 0) & (after < len(truth_time))]))
+    earlier = np.append(np.diff(time) == 0, False)  # of several steps at a stamp
+    truth_valid &= ~earlier
+    truth[earlier] = np.nan
     return Timeline(time, Inputs(*arrays), truth, truth_valid, counts)
 
 
@@ -186,11 +194,31 @@ def _window(start: float | None, stop: float | None) -> tuple[float, float]:
     return first, last
 
 
-def _slots(log: Log, rows: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spread sightings, in order of time, over steps: landmark (T, M), z (T, M, 2), valid (T, M)."""
-    step = np.searchsorted(time, log.sighting_time[rows])
-    slot = np.arange(len(rows)) - np.searchsorted(step, step)
-    shape = (len(time), int(slot.max(initial=0)) + 1)
+def _spread(time: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, int]:
+    """The stamps of the steps, some more than once if need be, and the number of slots M of each.
+
+    Args:
+        time: (T,) s, strictly increasing. seen: (K,) s, of sightings, each in `time`.
+    """
+    sightings = np.bincount(np.searchsorted(time, seen), minlength=len(time))
+
+    def steps(slots: int) -> np.ndarray:
+        return np.maximum(-(-sightings // slots), 1)
+
+    most = max(int(sightings.max()), 1)
+    choices = [most, *(2**i for i in range(most.bit_length()))]
+    room = [int(steps(slots).sum()) * (slots + 1) for slots in choices]  # a step itself takes about as much as a slot
+    best = int(np.argmin(room))
+    slots = choices[best] if _WORTH * room[best] < room[0] else most
+    return np.repeat(time, steps(slots)), slots
+
+
+def _fill(log: Log, rows: np.ndarray, time: np.ndarray, slots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Put sightings, in order of time, into the slots of the steps: landmark (T, M), z (T, M, 2), valid (T, M)."""
+    first = np.searchsorted(time, log.sighting_time[rows])
+    place = np.arange(len(rows)) - np.searchsorted(first, first)
+    step, slot = first + place // slots, place % slots
+    shape = (len(time), slots)
     landmark, z, valid = np.zeros(shape, np.int32), np.zeros((*shape, 2)), np.zeros(shape, bool)
     landmark[step, slot] = log.sighting_landmark[rows]
     z[step, slot] = log.sighting[rows]
