@@ -44,6 +44,8 @@ def study_figure(path: Path, report: dict[str, Any], dt: float) -> None:
         nis = [value for value in report["nis_per_step"] if value is not None]
         ax.plot(time[seen], nis, ".-", color=ESTIMATE, lw=0.8, ms=4, label="mean over observations")
         ax.axhline(2, color=BAND, lw=1)
+    else:
+        ax.plot([], [], label="no observation")
     ax.set(title="NIS of range and bearing: 2 if consistent", xlabel="time [s]", ylabel="NIS [–]")
     from_zero(ax)
 
