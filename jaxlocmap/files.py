@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _LIMIT, _MOST_BYTES = "JAXLOCMAP_MAX_BYTES", 2**27  # 128 MiB: the largest public logs have some 100
+SETTINGS = 2**16  # bytes, at most, of a file of settings: parsers of such files are slow, and take far more memory
+_LONGEST_WORDS = 1000  # characters
 _TEMPORARY = re.compile(r"\.(?P<name>.+)\.[0-9a-f]{16}\.writing(?P<suffix>\.[^.]+)?")
 
 
@@ -77,11 +79,15 @@ def too_large(path: str | Path, what: str = "a file") -> ValueError:
     return ValueError(f"{path}: expected {what} of at most {most_bytes():,} bytes, got more; {_LIMIT} raises the limit")
 
 
-def read(path: str | Path) -> bytes:
+def read(path: str | Path, *, most: int | None = None) -> bytes:
     """The content of a regular file.
 
+    Args:
+        path: of the file.
+        most: bytes, where a file of its kind is small; else `most_bytes`.
+
     Raises:
-        FileNotFoundError: nothing at `path`. ValueError: a folder or a device, or more than `most_bytes`.
+        FileNotFoundError: nothing at `path`. ValueError: a folder or a device, or more than `most`.
     """
     path = Path(path)
     if not path.exists():
@@ -89,9 +95,11 @@ def read(path: str | Path) -> bytes:
         raise FileNotFoundError(f"{path}: {what}")
     if not path.is_file():
         raise ValueError(f"{path}: expected a file, got a folder or a device")
-    limit = most_bytes()
+    limit = most or most_bytes()
     with path.open("rb") as stream:
         data = stream.read(limit + 1)
+    if len(data) > limit and most:
+        raise ValueError(f"{path}: expected a file of at most {most:,} bytes, got more")
     if len(data) > limit:
         raise too_large(path)
     return data
@@ -120,14 +128,18 @@ def reading(path: str | Path, what: str) -> Iterator[None]:
 
     Args:
         path: of the file. Of a ValueError it is put before the words, unless they start with it, or with that of a file
-            below it. Others, such as a stack that is too deep, say what was expected.
+            below it; and they are cut where they are long. Others, such as a stack that is too deep, say what was
+            expected.
         what: is expected of it, for the message.
     """
     try:
         yield
-    except (OSError, ValueError) as error:
-        if str(error).startswith(str(path)) or isinstance(error, OSError):
-            raise
-        raise ValueError(f"{path}: {str(error)[:500]}") from None
-    except (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError) as error:
+    except OSError:
+        raise
+    except ValueError as error:
+        said = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+        if len(said) > (most := len(f"{path}: ") + _LONGEST_WORDS):  # they may quote the file
+            said = f"{said[:most]} ..."
+        raise ValueError(said) from None
+    except Exception as error:  # of whatever kind: of a library that reads pictures, none is foreseen
         raise ValueError(f"{path}: expected {what}, got one that cannot be read: {type(error).__name__}") from error

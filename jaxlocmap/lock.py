@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import stat
 from pathlib import Path
 from typing import IO
 
@@ -29,6 +30,9 @@ class Lock:
         self.path = path
         while True:
             handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o666)
+            if not stat.S_ISREG(os.fstat(handle).st_mode):
+                os.close(handle)
+                raise OSError(f"{path}: expected a file, got a pipe or a device")
             self._file = os.fdopen(handle, "r+")
             _take(self._file, path)
             if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
@@ -64,7 +68,7 @@ def _take(file: IO[str], path: Path) -> None:
         try:
             owner = json.loads(file.read(1000))
             who = f"process {int(owner['process'])} on {str(owner['host'])[:100]!r}"
-        except (ValueError, TypeError, KeyError, RecursionError):
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
             who = "another process"
         finally:
             file.close()

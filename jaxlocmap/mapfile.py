@@ -131,7 +131,7 @@ def load_map(path: str | Path) -> LoadedMap:
             return super().compose_node(parent, index)
 
     with files.reading(path, "a map_server YAML"):
-        text = files.read(path)
+        text = files.read(path, most=files.SETTINGS)
         try:
             sheet = yaml.load(text, Loader)
         except (yaml.YAMLError, ValueError) as error:
@@ -142,6 +142,9 @@ def load_map(path: str | Path) -> LoadedMap:
         cells = _read_picture(picture, sheet)[::-1]
     with files.reading(path, "a grid"):
         return LoadedMap(cells, GridSpec(origin=sheet.origin, resolution=sheet.resolution, shape=cells.shape))
+
+
+_PIXEL, _ROW = {"1": 1, "L": 1, "I;16": 2, "I;16B": 2}, 16  # bytes that Pillow takes
 
 
 class _Sheet(NamedTuple):
@@ -162,7 +165,7 @@ class _Sheet(NamedTuple):
         if missing:
             raise ValueError(f"expected the fields {', '.join(needed)}, missing {', '.join(missing)}")
         image, mode, origin, negate = (fields.get(name, "trinary") for name in ("image", "mode", "origin", "negate"))
-        if not isinstance(image, str) or not image or "\0" in image:
+        if not isinstance(image, str) or not image or "\0" in image or len(image) > 1000:
             raise ValueError(f"image: expected the name of a file, got {_shown(image)}")
         if not isinstance(mode, str) or mode.lower() not in ("trinary", "scale", "raw"):
             raise ValueError(f"mode: expected trinary, scale or raw, got {_shown(mode)}")
@@ -218,11 +221,14 @@ def _read_picture(path: Path, sheet: _Sheet) -> np.ndarray:
     content = io.BytesIO(files.read(path))
     try:
         with (
-            warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning),
+            warnings.catch_warnings(action="ignore"),  # of large pictures, and of tags that nobody needs
             Image.open(content) as image,
         ):
             columns, rows = image.size
-            if columns * rows * len(image.getbands()) > files.most_bytes():
+            if image.format == "EPS":  # a program, which Pillow would run
+                raise UnidentifiedImageError
+            each = 4 if image.has_transparency_data else _PIXEL.get(image.mode, 4)
+            if rows * (columns * each + _ROW) > files.most_bytes():
                 raise files.too_large(path, "pixels")
             whole, scale = image, 1
             if image.mode.startswith("I"):  # grey of 16 bits

@@ -23,6 +23,7 @@ from jaxlocmap.lock import Lock
 _PARTS = 256  # at most: so little of a long study is lost when it dies
 _SYNC_EVERY = 1.0  # s; forcing a file to disk takes milliseconds, a quick study's part less
 _FOLDER, _MANIFEST = "parts", "manifest.json"
+_LARGEST_MANIFEST = 2**20  # bytes
 _LOCK = ".lock-"  # and the number of the process
 _MARK = "jaxlocmap study"  # what a manifest is known by
 _PART_MARK = b"jaxlocmap part\n"  # and the file of a part
@@ -162,7 +163,7 @@ class Parts:
     def _check_foreign(self, found: Mapping[str, Any] | None) -> None:
         """Raise where a file stands in a study's way that neither its manifest names nor a study has written."""
         named, manifest = self._named(found), self.folder / _MANIFEST
-        foreign = [file for file in self._part_files() if file not in named and not _is_part(file)]
+        foreign = [file for file in self._part_files() if not ((file in named and file.is_file()) or _is_part(file))]
         if found is None and manifest.exists() and not _may_be_manifest(manifest):
             foreign.append(manifest)
         if foreign:
@@ -229,7 +230,8 @@ class Parts:
         Raises:
             OSError: there is none. ValueError: it is damaged, or not of this study.
         """
-        whole = (self.folder / _name(part)).read_bytes()
+        file = self.folder / _name(part)
+        whole = file.read_bytes() if file.is_file() or not file.exists() else b""  # a pipe would be waited for
         begin = len(_PART_MARK) + hashlib.sha256().digest_size
         contents = whole[begin:]
         if whole[:begin] != _PART_MARK + self._checksum(part, contents):
@@ -274,9 +276,9 @@ class Parts:
     def _found(self) -> dict[str, Any] | None:
         """The manifest in the folder; None if there is none, or none that can be believed."""
         try:
-            found = json.loads((self.folder / _MANIFEST).read_bytes())
+            found = json.loads(files.read(self.folder / _MANIFEST, most=_LARGEST_MANIFEST))
             if found.pop("made by") == _MARK and found.pop("digest") == _own_digest(found):
-                return found
+                return found if all(type(found[name]) is int and found[name] > 0 for name in Split._fields) else None
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             pass
         return None
@@ -349,6 +351,8 @@ def _own_digest(study: Mapping[str, Any]) -> str:
 
 def _is_part(file: Path) -> bool:
     """Whether this is a part's file, damaged or not; an empty one holds nothing that could be lost."""
+    if not file.is_file():
+        return False
     with file.open("rb") as stream:
         begin = stream.read(len(_PART_MARK))
     return begin in (_PART_MARK, b"")
@@ -356,6 +360,8 @@ def _is_part(file: Path) -> bool:
 
 def _may_be_manifest(file: Path) -> bool:
     """Whether this may be what is left of a study's manifest."""
+    if not file.is_file():
+        return False
     with file.open("rb") as stream:
         begin = stream.read(1000)
     return not begin or _MARK.encode() in begin

@@ -85,21 +85,18 @@ class Params(NamedTuple):
         """
         with files.reading(path, f"a JSON object with {cls._fields}"):
             try:
-                fields = json.loads(files.read(path))
+                fields = json.loads(files.read(path, most=files.SETTINGS))
             except (json.JSONDecodeError, UnicodeDecodeError) as error:
                 raise ValueError(f"expected a JSON object with {cls._fields}: {error}") from None
-        if not isinstance(fields, dict) or set(fields) != set(cls._fields):
-            got = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
-            raise ValueError(f"{path}: expected exactly the fields {cls._fields}, got {got}")
-        try:
+            if not isinstance(fields, dict) or set(fields) != set(cls._fields):
+                got = sorted(fields) if isinstance(fields, dict) else type(fields).__name__
+                raise ValueError(f"expected exactly the fields {cls._fields}, got {got}")
             values = {name: np.asarray(value) for name, value in fields.items()}
             for name, value in values.items():
                 if value.dtype.kind not in "if":
                     raise ValueError(f"{name}: expected numbers, got {fields[name]!r}")
             params = cls(**{name: jnp.asarray(value.astype(float)) for name, value in values.items()})
             params.check()
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ValueError(f"{path}: {error}") from None
         return params
 
 

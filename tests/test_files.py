@@ -5,6 +5,7 @@ import json
 import os
 import resource
 import stat
+import struct
 import zlib
 
 import numpy as np
@@ -147,7 +148,10 @@ def test_whatever_is_wrong_with_parameters_names_their_file(tmp_path, text):
 
 
 def test_whatever_a_reader_raises_leaves_with_the_path_of_its_file():
-    for error in (KeyError("x"), RecursionError(), MemoryError(), TypeError("y"), ZeroDivisionError()):
+    for error in (
+        *(KeyError("x"), RecursionError(), MemoryError(), TypeError("y"), ZeroDivisionError()),
+        *(EOFError(), struct.error(), NotImplementedError(), AssertionError()),
+    ):
         with (
             pytest.raises(
                 ValueError, match=f"^here: expected a log, got one that cannot be read: {type(error).__name__}$"
@@ -157,6 +161,8 @@ def test_whatever_a_reader_raises_leaves_with_the_path_of_its_file():
             raise error
     with pytest.raises(ValueError, match=r"^here: wrong$"), files.reading("here", "a log"):
         raise ValueError("wrong")
+    with pytest.raises(ValueError, match=r"^here: w{1000} \.\.\.$"), files.reading("here", "a log"):
+        raise ValueError("here: " + "w" * 2000)
     with pytest.raises(ValueError, match=r"^here/below: wrong$"), files.reading("here", "a log"):
         raise ValueError("here/below: wrong")
     with pytest.raises(FileNotFoundError, match=r"^gone$"), files.reading("here", "a log"):

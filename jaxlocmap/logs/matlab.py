@@ -21,6 +21,7 @@ _HEADER = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15  # element types
 _NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {1: "cell", 2: "struct", 3: "object", 4: "char", 5: "sparse"} | dict.fromkeys(range(6, 16), "real")
+_DIMENSIONS = 32  # at most
 _COMPLEX = 0x0800  # flag
 
 _Order = Literal["little", "big"]
@@ -53,8 +54,10 @@ def _read(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     for name, content in _variables(path, data[_HEADER:], order):
         if name in names:
             try:
-                found[name] = _matrix(content, order)
+                found[name] = _matrix(path, content, order)
             except ValueError as error:
+                if str(error).startswith(str(path)):
+                    raise
                 raise ValueError(f"{path}: {name}: {error}") from None
     for name in names:
         if name not in found:
@@ -104,7 +107,7 @@ def _elements(data: bytes, order: _Order) -> Iterator[tuple[int, bytes]]:
         at = end if kind == _COMPRESSED else end + (-end % 8)  # all but compressed ones fill up to 8 bytes
 
 
-def _matrix(content: bytes, order: _Order) -> np.ndarray:
+def _matrix(path: str | Path, content: bytes, order: _Order) -> np.ndarray:
     parts = list(itertools.islice(_elements(content, order), 4))
     flags = int.from_bytes(parts[0][1][:4], order)
     kind = "complex" if flags & _COMPLEX else _CLASSES.get(flags & 0xFF, "unknown")
@@ -112,7 +115,10 @@ def _matrix(content: bytes, order: _Order) -> np.ndarray:
         raise ValueError(f"expected a matrix of real numbers, got class {kind}")
     sign = "<" if order == "little" else ">"
     shape = np.frombuffer(parts[1][1], f"{sign}i4")
-    if len(shape) < 2 or shape.min() < 0 or len(parts) < 4 or parts[3][0] not in _NUMBERS:
-        raise ValueError(f"damaged: dimensions {shape.tolist()}, {len(parts)} parts")
+    if not 2 <= len(shape) <= _DIMENSIONS or shape.min() < 0 or len(parts) < 4 or parts[3][0] not in _NUMBERS:
+        raise ValueError(f"damaged: dimensions {shape[:_DIMENSIONS].tolist()}, {len(parts)} parts")
     values = np.frombuffer(parts[3][1], sign + _NUMBERS[parts[3][0]])
-    return values.astype(np.float64).reshape(shape.tolist(), order="F")
+    if 8 * values.size > files.most_bytes():
+        raise files.too_large(path, "numbers")
+    with np.errstate(invalid="ignore"):  # a NaN of another pattern is one all the same
+        return values.astype(np.float64).reshape(shape.tolist(), order="F")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import math
+import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
@@ -42,11 +43,15 @@ def lines(path: str | Path) -> Iterator[tuple[int, str]]:
     """
     data = read_bytes(path)
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        data = data.decode("utf-16", errors="replace").encode()
+        data = data[: len(data) // 2 * 2].decode("utf-16").encode()
     if b"\0" in data:
         line = data.count(b"\n", 0, data.index(b"\0")) + 1
         raise ValueError(f"{path}:{line}: expected text, got binary data")
-    for number, raw in enumerate(data.splitlines(), 1):
+    data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    number, end = 1, 0
+    for match in re.finditer(rb"[^\n]+", data):  # megabytes of blank lines are passed over at once
+        number += data.count(b"\n", end, match.start())
+        raw, end = match[0], match.end()
         if len(raw) > _LONGEST_LINE:
             raise ValueError(f"{path}:{number}: expected lines of at most {_LONGEST_LINE:,} bytes, got {len(raw):,}")
         # Latin-1 takes any byte: old logs have comments in unknown encodings, and numbers are ASCII.

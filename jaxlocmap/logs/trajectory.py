@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,15 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlocmap import files
-from jaxlocmap.logs.text import lines, numbers
+from jaxlocmap.logs.text import LARGEST, lines, numbers
 from jaxlocmap.logs.timeline import backward, check_overlap, interpolate, last_at_each_stamp
 
 _TUM = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
 _UPPER = ("xx", "xy", "xt", "yy", "yt", "tt")  # of a covariance of x, y and theta
 _ALIASES = {"time": "t", "timestamp": "t", "stamp": "t", "yaw": "theta"}
 _QUATERNION = ("qx", "qy", "qz", "qw")
-_ROS = re.compile(r".*cov(?:ariance)?[^0-9]*([0-9]+)[^0-9]*")
+_ROS = re.compile(r"cov(?:ariance)?[^0-9]*([0-9]{1,2})[^0-9]*")
 _ROS_ENTRIES = 36  # of x, y, z, roll, pitch, yaw
+_MOST_COMPONENTS = 10  # of an innovation: their columns S{i}{j} can be told apart
 _PLANE = np.array([0, 1, 5])  # x, y and yaw among them
 
 
@@ -149,10 +152,24 @@ def _innovations(path: str | Path, stamps: np.ndarray) -> dict[str, np.ndarray]:
     where = f"{path}:{rows[0][0]}"
     names = [_ALIASES.get(name.strip(), name.strip()) for name in rows[0][1].split(",")]
     size = sum(re.fullmatch(r"nu[0-9]+", name) is not None for name in names)
+    if size > _MOST_COMPONENTS:
+        raise ValueError(f"{where}: expected at most {_MOST_COMPONENTS} components of an innovation, got {size}")
     upper = [(i, j) for i in range(size) for j in range(i, size)]
     needed = ["t", *(f"nu{i}" for i in range(size)), *(f"S{i}{j}" for i, j in upper)]
     _check_names(names, needed if size else [*needed, "nu0"], {"landmark", "accepted"}, where)
     table = _parsed(path, rows[1:], names, ",")
+    for name, allowed, words in (
+        (
+            "landmark",
+            lambda value: (value >= -1) & (value < 2**31) & (value == np.floor(value)),
+            "a whole number >= -1",
+        ),
+        ("accepted", lambda value: (value == 0) | (value == 1), "0 or 1"),
+    ):
+        wrong = ~allowed(table.get(name, np.zeros(1)))
+        if np.any(wrong):
+            at = int(np.argmax(wrong))
+            raise ValueError(f"{path}:{rows[1 + at][0]}: {name}: expected {words}, got {table[name][at]}")
     step = np.searchsorted(stamps, table["t"], side="right") - 1
     if np.any(step < 0):
         line = rows[1 + int(np.argmax(step < 0))][0]
@@ -161,6 +178,8 @@ def _innovations(path: str | Path, stamps: np.ndarray) -> dict[str, np.ndarray]:
     step = step[order]
     slot = np.arange(len(step)) - np.searchsorted(step, step)
     shape = len(stamps), int(slot.max()) + 1
+    if math.prod(shape) * (size + size**2) * 8 > files.most_bytes():
+        raise files.too_large(path, "innovations, every step having as many as the fullest,")
     nu, S = np.full((*shape, size), np.nan), np.full((*shape, size, size), np.nan)
     nu[step, slot] = np.column_stack([table[f"nu{i}"] for i in range(size)])[order]
     for i, j in upper:
@@ -191,12 +210,12 @@ def _columns(line: str, where: str) -> list[str]:
 
 def _column(name: str) -> str:
     name = name.strip().strip('"')
-    ros = _ROS.fullmatch(name.lower())
+    ros = _ROS.fullmatch(name.lower(), max(name.lower().rfind("cov"), 0))
     return f"cov_{int(ros[1])}" if ros else _ALIASES.get(name, name)
 
 
 def _check_names(names: list[str], needed: list[str], others: set[str], where: str) -> None:
-    doubled = sorted({name for name in names if names.count(name) > 1})
+    doubled = sorted(name for name, times in collections.Counter(names).items() if times > 1)
     missing = [name for name in needed if name not in names]
     unknown = [name for name in names if name not in needed and name not in others]
     for what, some in (("missing", missing), ("doubled", doubled), ("unknown", unknown)):
@@ -232,17 +251,20 @@ def _parsed(
         fields = [field.strip() for field in line.split(separator)]
         values.append(np.array(numbers(fields, names, where, finite=False)))
         stamp = values[-1][names.index("t")]
-        if not np.isfinite(stamp):
-            raise ValueError(f"{where}: t: expected a finite stamp, got {stamp}")
+        if not abs(stamp) <= LARGEST:
+            wanted = f"stamp of a size up to {LARGEST:g}" if np.isfinite(stamp) else "finite stamp"
+            raise ValueError(f"{where}: t: expected a {wanted}, got {stamp}")
     return dict(zip(names, np.array(values).T, strict=True))
 
 
 def _yaw(table: dict[str, np.ndarray], path: str | Path) -> np.ndarray:
     x, y, z, w = (table[name] for name in _QUATERNION)
-    length = x * x + y * y + z * z + w * w
-    if np.any(length == 0):
-        raise ValueError(f"{path}: qx, qy, qz, qw: expected a rotation, got a quaternion of length 0")
-    return np.arctan2(2 * (w * z + x * y) / length, 1 - 2 * (y * y + z * z) / length)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is no number is NaN in the end
+        length = x * x + y * y + z * z + w * w
+        if np.any(length == 0):
+            raise ValueError(f"{path}: qx, qy, qz, qw: expected a rotation, got a quaternion of length 0")
+        yaw = np.arctan2(2 * (w * z + x * y) / length, 1 - 2 * (y * y + z * z) / length)
+    return np.where(np.isfinite(length), yaw, np.nan)
 
 
 def _covariance(table: dict[str, np.ndarray]) -> np.ndarray | None:

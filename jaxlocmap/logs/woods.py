@@ -9,6 +9,7 @@ import numpy as np
 from jaxlocmap import files
 from jaxlocmap.logs.matlab import read_matrices
 from jaxlocmap.logs.record import Log
+from jaxlocmap.logs.text import LARGEST
 
 _VECTORS = ("t", "v", "om", "x_true", "y_true", "th_true", "true_valid")
 _SCALARS = ("d", "r_var", "b_var", "v_var", "om_var")
@@ -52,8 +53,8 @@ def _log(path: str | Path, fields: dict[str, np.ndarray]) -> Log:
     for name, expected in shapes.items():
         if fields[name].shape != expected:
             raise ValueError(f"{path}: {name}: expected shape {expected}, got {fields[name].shape}")
-        if name not in ("r", "b") and not np.all(np.isfinite(fields[name])):
-            raise ValueError(f"{path}: {name}: expected finite values")
+        if name not in ("r", "b") and not np.all(np.abs(fields[name]) <= LARGEST):
+            raise ValueError(f"{path}: {name}: expected finite values of a size up to {LARGEST:g}")
     time, distance, bearing = fields["t"][:, 0], fields["r"], fields["b"]
     if not np.all(np.diff(time) > 0):
         raise ValueError(f"{path}: t: expected increasing stamps, got {np.sum(np.diff(time) <= 0)} that do not")
