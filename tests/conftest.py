@@ -40,6 +40,13 @@ def tolerance():
     return lambda double, single: double if X64 else single
 
 
+@pytest.fixture
+def as_a_program():
+    """Not in the strict session: a program makes its own."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
+
+
 class Course(NamedTuple):
     """The course's run, ready for the library: what its robot measured and what its filter believed."""
 
