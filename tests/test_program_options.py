@@ -549,7 +549,7 @@ def test_single_runs_are_judged_one_by_one(monkeypatch):
     judged = iter(
         [(2.5, (2.0, 4.0), "consistent"), (4.5, (2.0, 4.0), "over-confident"), (2.0, (2.0, 4.0), "undecided: x")]
     )
-    runs, samples = [], iter((10.0, 50.0, 30.0))
+    runs, samples = [], iter((10.0, 50.0, 33.0))
 
     def monte_carlo(single, key, count, params, world, noise, prior, keep_runs):
         assert (count, keep_runs, single.scenario) == (1, True, simulate.LOOP)
@@ -570,7 +570,7 @@ def test_single_runs_are_judged_one_by_one(monkeypatch):
     assert row == {
         "scenario": "loop",
         "steps": 1200,
-        "independent_samples": 30.0,
+        "independent_samples": 33.0,
         "anees": 3.0,
         "band_holds": 2 / 3,
         "dishonest": 1 / 3,
