@@ -317,6 +317,33 @@ def test_what_the_linear_robot_is_tuned_by(monkeypatch, fits, quick, installed):
         assert rowed.calls[-1][0][1] is B
 
 
+@pytest.mark.parametrize("quick", [False, True])
+def test_okf_gets_the_linear_robot_in_its_own_terms(monkeypatch, x64, quick):
+    """How far along x and which heading each sighting says; it tunes the noise of a step, ours is of a control."""
+    train = tune_compare._linear_drives(np.random.default_rng(0), 3, 4)
+    model = SimpleNamespace(get_Q=lambda: np.diag([0.25, 0.5]), get_R=lambda: np.diag([1.0, 2.0]))
+    okf = SimpleNamespace(OKF=Recorder(model), train=Recorder())
+    torch = SimpleNamespace(
+        manual_seed=Recorder(), eye=np.eye, tensor=np.array, diag=np.diag, zeros=np.zeros, sum=np.sum, double=float
+    )
+    torch.eye = lambda n, dtype: np.eye(n)
+    monkeypatch.setattr(tune_compare.importlib, "import_module", lambda name: {"okf": okf, "torch": torch}[name])
+    monkeypatch.setattr(tune_compare, "_DT", 0.5)
+    params, _ = tune_compare._okf(train, tune_compare.CompareConfig(seed=6, quick=quick))
+    np.testing.assert_allclose(params.Q, np.diag([1.0, 2.0]), rtol=1e-12)
+    np.testing.assert_allclose(params.R, np.diag([1.0, 2.0]), rtol=1e-12)
+    assert torch.manual_seed.calls == [((6,), {})]
+    ((same, z, x), how) = okf.train.calls[0]
+    assert (same, how["n_epochs"], how["save_best"]) == (model, 1 if quick else 10, not quick)
+    truth = np.asarray(train.truth)
+    np.testing.assert_array_equal(x, truth[..., [0, 2]])
+    assert np.abs(np.array(z) - truth[..., [0, 2]]).max() < 1  # a few deviations, of 0.2 m and 0.04 rad
+    assert np.std((np.array(z) - truth[..., [0, 2]])[..., 1]) < 0.08
+    settings = okf.OKF.calls[0][1]
+    np.testing.assert_allclose(settings["P0"], np.diag([1e-2, 1e-4]), rtol=1e-12)
+    assert settings["loss_fun"](np.array([1.0, 2.0]), np.array([3.0, 5.0])) == 13
+
+
 def test_tables_of_the_comparison():
     optimiser = {"optimiser": "o", "evaluations_to_best": 3, "seconds_to_best": 0.26, "evaluations": 9, "seconds": 1.25}
     optimiser |= {"anees": 3.123, "nis_mean": 2.456, "gate_accept_rate": 0.98765}

@@ -41,13 +41,16 @@ def key_data(key):
 def scene(monkeypatch):
     """What a scenario simulates to tune on, the studies it runs to judge, and what it scores one scan ahead."""
     stubs = {
-        "simulated": Recorder("batch"),
+        "simulated": Recorder(),
         "monte_carlo": Recorder(SimpleNamespace(value="totals")),
         "summarise": None,
         "foresight": Recorder({"log_loss": 0.5}),
     }
     stubs["summarise"] = summarise = Recorder()
-    monkeypatch.setattr(tune_sources.tuning, "simulated", stubs["simulated"])
+    simulated = stubs["simulated"]
+    monkeypatch.setattr(
+        tune_sources.tuning, "simulated", lambda *args, **how: simulated(*args, **how) or f"batch of {args[1]}"
+    )
     monkeypatch.setattr(tune_sources, "monte_carlo", stubs["monte_carlo"])
     monkeypatch.setattr(tune_sources, "summarise", lambda *args: summarise(*args) or {"anees": 3.0})
     monkeypatch.setattr(tune_sources, "_foresight", stubs["foresight"])
@@ -60,7 +63,8 @@ def test_a_scenario_is_tuned_validated_and_judged_on_drives_of_their_own(scene):
     assert [args[1] for args, _ in scene.simulated.calls] == [40, 10]
     assert key_data(train[0][0]) != key_data(validation[0][0])
     assert train[1] == validation[1] == {"scenario": simulate.LOOP, "scans": False, "worlds": False}
-    assert (source.name, source.dt, source.train) == ("loop, euler motion, 40 runs", 0.1, "batch")
+    assert (source.name, source.dt) == ("loop, euler motion, 40 runs", 0.1)
+    assert (source.train, source.compared, source.validation) == ("batch of 40", "batch of 40", "batch of 10")
     config = source.config
     assert (config.motion, config.gate_probability, config.gate_softness, config.grid) == ("euler", 0.999, 2.0, None)
     np.testing.assert_array_equal(source.start.R, simulate.course_params().R)
@@ -90,7 +94,7 @@ def test_a_map_is_tuned_and_judged_in_rooms_of_their_own(scene):
     assert source.evidence(START) == {"anees": 3.0, "one_scan_ahead": {"log_loss": 0.5}}
     ((study, _, runs, *_), _) = scene.monte_carlo.calls[0]
     assert (runs, study.config.grid) == (200, simulate.CAPSTONE.grid)
-    assert scene.foresight.calls == [((START, "batch", study.config), {})]
+    assert scene.foresight.calls == [((START, "batch of 64", study.config), {})]
     both = tune_sources.from_scenario("capstone", "arc", 4, 10, wanted("map", "pose"))
     np.testing.assert_array_equal(both.start.R, course.R)
     assert [args[1] for args, _ in scene.simulated.calls[3:]] == [10, 4, 1]
