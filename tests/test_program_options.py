@@ -6,6 +6,7 @@ import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -174,6 +175,63 @@ def test_a_reference_is_run_where_start_or_gate_make_something_of_a_filter(monke
     assert (consistency._reference(scenario, settings, config, 10) is not None) == needed
 
 
+class Mapped(NamedTuple):
+    log_odds: object
+
+
+def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
+    scenario = dataclasses.replace(simulate.LOOP, steps=4)
+    settings = scenario.config(motion="euler", gate_probability=0.9)
+    drove = Recorder((SimpleNamespace(pose=np.full((4, 3), 2.0)), {"inputs": np.ones(4)}))
+    monkeypatch.setattr(consistency.simulate, "simulate", drove)
+    ran = Recorder((Mapped(np.full((2, 2), 3.0)), np.full((4, 3), 5.0)))
+    monkeypatch.setattr(consistency, "run", lambda params, state, inputs, **how: ran(params.R[0, 0], inputs, **how))
+    monkeypatch.setattr(consistency.plotting, "map_figure", figure := Recorder())
+    key = jax.random.key(6)
+    consistency._picture_of_one_run(tmp_path / "a.png", key, simulate.course_params(), scenario, settings)
+    ((given, world, noise, start), how) = drove.calls[0]
+    assert same_key(given, 6)
+    assert (noise, how) == (simulate.Noise(), {"scenario": scenario})
+    np.testing.assert_allclose(start, scenario.start, rtol=1e-6)
+    ((_, inputs), how) = ran.calls[0]
+    assert (set(inputs), how["config"], how["collect"]) == ({"inputs"}, settings, consistency._poses)
+    assert how["beam_angles"].shape == (scenario.beams,)
+    ((path, log_odds, grid, beliefs), how) = figure.calls[0]
+    assert (path, grid) == (tmp_path / "a.png", settings.grid)
+    assert (log_odds.tolist(), beliefs[0].tolist(), how["truth"][0].tolist()) == ([[3, 3], [3, 3]], [5] * 3, [2] * 3)
+    np.testing.assert_array_equal(how["segments"], world.segments)
+    assert consistency._poses(None, SimpleNamespace(belief=SimpleNamespace(mean="mean")), None) == "mean"
+
+
+def test_what_consistency_shows(monkeypatch):
+    monkeypatch.setattr(consistency, "show", shown := Recorder())
+    monkeypatch.setattr(consistency, "print_verdicts", Recorder())
+    monkeypatch.setattr(consistency.CONSOLE, "print", said := Recorder())
+    monkeypatch.setattr(consistency, "pose_rows", lambda report: [("p", "", "")])
+    monkeypatch.setattr(consistency, "innovation_rows", lambda report: [("i", "", "")])
+    report = {"anees_median_run": 2.5, "anees_undiverged": 3.25, "anees_undiverged_interval_95": (3.0, 3.5)}
+    report |= {"nees_steps_in_band": 0.945, "nees_steps_in_band_interval_95": (0.9, 0.97), "flagged_steps": 6}
+    phase = {"from_s": 1.0, "to_s": 2.5, "anees": 4.5, "band_95": (2.75, 3.25)}
+    report |= {"nees_phases": [phase], "map": {"entropy_bits": 1234.5, "brier": 0.0625, "brier_base_rate": 0.125}}
+    report |= {"scenario": "loop", "motion": "arc", "runs": 50, "runs_per_s": 99.6, "compile_s": 1.25, "chunk": 8}
+    consistency._print(report | {"devices": 2, "processes": 3})
+    (((title, rows), _),) = shown.calls
+    assert title == "loop, arc motion, 50 runs"
+    assert rows == [
+        ("p", "", ""),
+        ("median run's average NEES", "2.5", ""),
+        ("ANEES of undiverged runs", "3.250 [3, 3.5]", ""),
+        ("steps inside the NEES band", "94.5 % [90, 97]", "95 %"),
+        ("i", "", ""),
+        ("flagged steps", "6", "0"),
+        ("NEES from 1 to 2.5 s", "4.5", "[2.75, 3.25]"),
+        ("map entropy", "1234 bits", ""),
+        ("map Brier score", "0.0625", "0 is perfect, 0.125 knows only how many"),
+    ]
+    words = "100 runs/s after 1.2 s of compilation, in chunks of 8 runs on 2 device(s) of 3 process(es)"
+    assert said.calls == [((words,), {})]
+
+
 # --- Sweeps
 
 
@@ -271,6 +329,36 @@ def test_the_report_of_a_sweep(monkeypatch, tmp_path, plant, across):
     assert (path, shown) == (tmp_path / "sweep.png", report)
     assert labels == (sweep.SWEPT[across].meaning, sweep.SWEPT[up].meaning)
     assert tuple(map(len, ticks)) == shape[::-1]
+
+
+def shown_tables(printed):
+    """Rows of each table that was printed, and the sentences."""
+    tables = [args[0] for args, _ in printed.calls]
+    return [
+        table if isinstance(table, str) else [list(row) for row in zip(*(c.cells for c in table.columns), strict=True)]
+        for table in tables
+    ]
+
+
+@pytest.mark.parametrize("across", ["gate_probability", "outlier_rate"])
+def test_what_a_sweep_shows(monkeypatch, across):
+    monkeypatch.setattr(sweep.CONSOLE, "print", printed := Recorder())
+    values = {"gate_probability": [0.9, 1.0], "outlier_rate": [0.25]}
+    up = next(name for name in values if name != across)
+    cells = [
+        {"gate_probability": gate, "outlier_rate": 0.25, "anees": anees, "consistent": anees == 3}
+        | {"rmse_position_m": anees / 10, "diverged_runs": int(anees)}
+        for gate, anees in ((0.9, 3.0), (1.0, 7.0))
+    ]
+    report = {"x": across, "y": up, "x_values": values[across], "y_values": values[up], "cells": cells}
+    report |= {"what_the_gate_buys": sweep.what_the_gate_buys("outlier_rate", cells), "gate_verdict": "it buys"}
+    sweep._print(report | {"verdict": "so", "runs_per_s": 99.6, "compile_s": 1.25})
+    grid, gate, *said = shown_tables(printed)
+    assert grid == ([["0.25", "3*", "7"]] if across == "gate_probability" else [["0.9", "3*"], ["1", "7"]])
+    assert gate == [["0.25", "0.9", "0.3000 m", "3", "3", "0.7000 m", "7", "7"]]
+    assert printed.calls[1][0][0].columns[0].header == "outlier_rate"
+    assert said == ["it buys", "so", "100 runs/s, every cell's counted, after 1.2 s of compilation"]
+    assert sweep._figures(None) == ("–", "–", "–")
 
 
 # --- The course's run
@@ -432,6 +520,38 @@ def test_the_words_on_float32():
     assert precision.verdict(row | {"detector_sharper": 100.0}) == (
         "100 times sharper: float32 breaks 11 of 6,000 covariances, 7 with the short form; ANEES -3.0e-02 ± 2e-06"
     )
+
+
+@pytest.mark.parametrize(("sharper", "head"), [(1.0, "1,200 steps"), (100.0, "100 times")])
+def test_what_precision_shows(monkeypatch, sharper, head):
+    monkeypatch.setattr(precision.CONSOLE, "print", printed := Recorder())
+    names = ("anees", "rmse_position_m", "rmse_yaw_rad")
+    double = {name: i + 1.0 for i, name in enumerate(names)} | {f"{name}_standard_error": 0.5 for name in names}
+    counts = {"not_definite_steps": 1, "flagged_steps": 2}
+    row = {"steps": 1200, "runs": 5, "detector_sharper": sharper, "float64": double | counts}
+    for k, which in enumerate(("float32", "short_form"), start=1):
+        row[which] = {f"{name}_difference": k * (i + 1e-3) for i, name in enumerate(names)}
+        row[which] |= {f"{name}_difference_standard_error": 0.25 * k for name in names}
+        row[which] |= {"not_definite_steps": 10 * k, "flagged_steps": 2000 * k}
+        row[which] |= {"largest_position_difference_m": k * 1e-6, "largest_yaw_difference_rad": k * 2e-6}
+        row[which] |= {"largest_covariance_difference": k * 3e-6}
+    precision._print("title", [row])
+    (table,) = (args[0] for args, _ in printed.calls)
+    assert (table.title, table.columns[1].header) == ("title", head)
+    cells = dict(shown_tables(printed)[0][i] for i in (0, 1, 4, 10, 11, 12, 13, 14))
+    assert cells == {
+        "runs": "5",
+        "ANEES (3), float64": "1 ± 0.5",
+        "position RMSE, m, float64": "2 ± 0.5",
+        "not positive definite, steps": "1 / 10 / 20",
+        "flagged by the filter, steps": "2 / 2,000 / 4,000",
+        "largest position difference, m": "1.0e-06 / 2.0e-06",
+        "largest yaw difference, rad": "2.0e-06 / 4.0e-06",
+        "largest covariance difference, σσ": "3.0e-06 / 6.0e-06",
+    }
+    differences = [row[1] for row in shown_tables(printed)[0]][2:10]
+    assert differences[:2] == ["+1.0e-03 ± 0.2", "+2.0e-03 ± 0.5"]
+    assert differences[3:5] == ["+1.0e+00 ± 0.2", "+2.0e+00 ± 0.5"]
 
 
 # --- Verdicts on honest filters

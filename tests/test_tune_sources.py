@@ -296,7 +296,7 @@ def test_what_is_foreseen_is_averaged_over_cells(monkeypatch):
         cells=np.array(8.0),
         bin_cells=np.array([4.0, 0.0, 4.0]),
         bin_probability=np.array([1.0, 0.0, 3.0]),
-        bin_hits=np.array([2.0, 0.0, 3.5]),
+        bin_hits=np.array([2.0, 0.0, 2.5]),
     )
     monkeypatch.setattr(tune_sources, "_foreseen", lambda params, batch, config: sums)
     assert tune_sources._foresight(START, None, None) == {
@@ -305,7 +305,7 @@ def test_what_is_foreseen_is_averaged_over_cells(monkeypatch):
         "calibration_error": 1.5 / 8,
         "calibration_cells": [4, 0, 4],
         "calibration_probability": [0.25, 0, 0.75],
-        "calibration_frequency": [0.5, 0, 0.875],
+        "calibration_frequency": [0.5, 0, 0.625],
     }
 
 
