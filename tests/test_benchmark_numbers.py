@@ -445,6 +445,18 @@ def test_the_peers_model_has_the_derivatives_it_says(x64):
     np.testing.assert_allclose(mean, peers._moved(peers.PRIOR_MEAN), rtol=1e-12)
 
 
+def test_drives_of_the_peers_start_where_the_prior_says_and_turn_as_the_noise_says():
+    drives = peers.drive(4000, 3, 5)
+    turned = drives.truth[:, 1:] - peers._moved(drives.truth[:, :-1])
+    np.testing.assert_allclose(turned[..., :2], 0, rtol=0, atol=1e-12)
+    assert np.std(turned[..., 2]) == pytest.approx(0.05 * 0.1, rel=0.05)
+    first = drives.truth[:, 0] - peers._moved(peers.PRIOR_MEAN)
+    # A start turned by 0.1 rad moves the end of a step of 3 cm by no more than 3 mm.
+    np.testing.assert_allclose(first.std(0), [0.2, 0.2, math.hypot(0.1, 0.005)], rtol=0.05)
+    np.testing.assert_allclose(first.mean(0), 0, rtol=0, atol=0.02)
+    assert not np.array_equal(peers.drive(4000, 3, 6).z, drives.z)
+
+
 @pytest.mark.parametrize(("share", "runs"), [(1, 40), (5, 8), (1000, jax.local_device_count())])
 def test_a_filter_is_timed_over_all_steps_of_its_runs(monkeypatch, share, runs):
     clock = iter([0.0, 3.0, 10.0, 14.0])

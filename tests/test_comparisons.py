@@ -244,6 +244,32 @@ def test_what_a_gradient_costs(monkeypatch):
     assert (cost["bytes_a_run_240"], cost["bytes_a_run_3840"], cost["memory_ratio"]) == (3000, 39000, 13)
 
 
+def test_the_memory_of_a_gradient_is_a_run_s_with_everything(monkeypatch):
+    memory = SimpleNamespace(argument_size_in_bytes=100, temp_size_in_bytes=20, output_size_in_bytes=8)
+    lowered = Recorder(SimpleNamespace(compile=lambda: SimpleNamespace(memory_analysis=lambda: memory)))
+    monkeypatch.setattr(
+        tune_compare,
+        "jax",
+        SimpleNamespace(
+            eval_shape=lambda f, key: f(key),
+            random=jax.random,
+            jit=lambda f: SimpleNamespace(lower=lowered),
+            value_and_grad=lambda f: f,
+        ),
+    )
+    monkeypatch.setattr(tuning, "simulated", drawn := Recorder("batch"))
+    monkeypatch.setattr(tuning, "Objective", objective := Recorder("objective"))
+    monkeypatch.setattr(tuning, "coordinates_objective", asked := Recorder())
+    assert tune_compare._bytes_a_run(480, runs=4) == 128 / 4
+    ((_, runs, *_), how) = drawn.calls[0]
+    assert (runs, how["scenario"].steps, how["scans"]) == (4, 480, True)
+    ((settings, weights), _) = objective.calls[0]
+    assert (settings.grid is not None, weights) == (True, (("innovation", 1.0), ("map", 1.0)))
+    assert asked.calls[0][0][2] == ("v", "w", "range", "bearing", "l_occ", "l_free")
+    ((at, batch), _) = lowered.calls[0]
+    assert (set(at), batch) == ({"v", "w", "range", "bearing", "l_occ", "l_free"}, "batch")
+
+
 def test_the_linear_robot_drives_and_sees_as_it_says(x64):
     rng = np.random.default_rng(0)
     batch = tune_compare._linear_drives(rng, 40, 50)

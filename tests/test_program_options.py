@@ -145,6 +145,17 @@ def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
     consistency.main(dataclasses.replace(config, map=False, start="drawn"))
     assert len(pictured.calls) == 1
     assert json.loads((tmp_path / "report.json").read_text())["prior"] == "drawn"
+    written_by_process_0_alone(monkeypatch, consistency, config)
+
+
+def written_by_process_0_alone(monkeypatch, program, config):
+    """Of several processes the others keep still; all of them clear their parts."""
+    (config.out / "report.json").unlink()
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    cleared = len(program.finish.calls)
+    program.main(config)
+    assert not (config.out / "report.json").exists()
+    assert len(program.finish.calls) == cleared + 1
 
 
 @pytest.mark.parametrize(("runs", "count"), [(50, 2000), (3000, 3000), (50_000, 20_000)])
@@ -329,6 +340,7 @@ def test_the_report_of_a_sweep(monkeypatch, tmp_path, plant, across):
     assert (path, shown) == (tmp_path / "sweep.png", report)
     assert labels == (sweep.SWEPT[across].meaning, sweep.SWEPT[up].meaning)
     assert tuple(map(len, ticks)) == shape[::-1]
+    written_by_process_0_alone(monkeypatch, sweep, config)
 
 
 def shown_tables(printed):
