@@ -242,10 +242,11 @@ def mapped(monkeypatch):
 
 
 def test_the_report_is_that_of_the_map(tmp_path, mapped):
-    ranges = [1.0, 2.0, 30.0, math.inf, math.nan]
+    ranges = [1.0, 2.0, 5.0, math.inf, math.nan]
     path = logged(tmp_path, *((ranges, (0.5 * k, 0, 0)) for k in range(6)))
     report, cells, spec = make(tmp_path, path, resolution=0.25, max_range=5.0, fov=80.0)
     rows, columns = cells.shape
+    assert spec.resolution == mapped[0].calls[0][0][2].grid.resolution == 0.25
     assert columns > rows + 4  # the robot drives along x
     p = 1 / (1 + math.exp(3.0)), 1 / (1 + math.exp(2.0))
     bits = sum(n * -(q * math.log2(q) + (1 - q) * math.log2(1 - q)) for n, q in zip((1, 3), p, strict=True))
