@@ -62,6 +62,9 @@ def test_a_scenario_is_tuned_validated_and_judged_on_drives_of_their_own(scene):
     train, validation = scene.simulated.calls
     assert [args[1] for args, _ in scene.simulated.calls] == [40, 10]
     assert key_data(train[0][0]) != key_data(validation[0][0])
+    for args, _ in scene.simulated.calls:
+        np.testing.assert_array_equal(args[2].segments, simulate.room().segments)
+        assert args[3] == simulate.Noise()
     assert train[1] == validation[1] == {"scenario": simulate.LOOP, "scans": False, "worlds": False}
     assert (source.name, source.dt) == ("loop, euler motion, 40 runs", 0.1)
     assert (source.train, source.compared, source.validation) == ("batch of 40", "batch of 40", "batch of 10")
