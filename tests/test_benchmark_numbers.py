@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 import reference
-from programs import Recorder
+from programs import Recorder, stop
 
 from jaxlocmap import simulate
 
@@ -65,7 +65,8 @@ def test_options_of_the_benchmark(monkeypatch, tmp_path, options, size, sections
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])
-def test_seconds_that_are_none_are_refused(tmp_path, value):
+def test_seconds_that_are_none_are_refused(monkeypatch, tmp_path, value):
+    monkeypatch.setattr(benchmark, "merge_kernels", stop)
     with pytest.raises(ValueError, match="seconds: expected more than 0, finite, got"):
         benchmark.main(benchmark.BenchmarkConfig(seconds=value, out=tmp_path))
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from programs import Recorder
+from programs import Recorder, stop
 from scipy.stats import chi2
 
 from jaxlocmap import Config, Gaussian, Params, simulate, tuning
@@ -98,7 +98,8 @@ def test_options_of_the_comparison(monkeypatch, tmp_path, options, runs, losses,
 
 
 @pytest.mark.parametrize("name", ["runs", "judge_runs"])
-def test_too_few_runs_to_compare_are_refused(tmp_path, name):
+def test_too_few_runs_to_compare_are_refused(monkeypatch, tmp_path, name):
+    monkeypatch.setattr(tune_compare.hosts, "use_all_cores", stop)
     with pytest.raises(ValueError, match=f"{name}: expected at least 10"):
         tune_compare.main(tune_compare.CompareConfig(**{name: 9}, out=tmp_path))
 
