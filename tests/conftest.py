@@ -40,6 +40,14 @@ def tolerance():
     return lambda double, single: double if X64 else single
 
 
+@pytest.fixture
+def as_a_program():
+    """Not in the strict session: a program makes its own."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
+    jax.config.update("jax_disable_most_optimizations", X64)
+
+
 class Course(NamedTuple):
     """The course's run, ready for the library: what its robot measured and what its filter believed."""
 

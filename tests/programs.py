@@ -15,6 +15,26 @@ ON_CPU = {**os.environ, "JAX_PLATFORMS": "cpu"}
 COMPUTING = {"devices", "processes", "resumed_runs", "wall_s", "compile_s", "run_s", "runs_per_s"}
 
 
+class Recorder:
+    """In the place of a function: keeps what it is called with, and hands back what it is told to."""
+
+    def __init__(self, answer=None):
+        self.calls, self.answer = [], answer
+
+    def __call__(self, *args, **kwargs):
+        self.calls.append((args, kwargs))
+        return self.answer
+
+
+class Enough(Exception):
+    """What was to be seen has been seen: the program need not go on."""
+
+
+def stop(*_, **__):
+    """In the place of a function after which nothing is of interest."""
+    raise Enough
+
+
 def start(file, *arguments, **environment):
     """Start a program as from a command line."""
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "XLA_FLAGS"))}

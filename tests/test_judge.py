@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import reference
 import scipy.stats
+from programs import Recorder
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import judge as program
@@ -516,6 +517,80 @@ def test_an_innovation_before_the_first_stamp_is_refused_by_its_line(tmp_path):
     path = csv(tmp_path / "nu.csv", ("t", "nu0", "nu1", "S00", "S11"), [(0.0,) * 5])
     with pytest.raises(ValueError, match=f"{path}:1: expected the columns t, nu0, nu1, S00, S01, S11; missing: 'S01'"):
         read_innovations(path, np.array([0.0, 1.0]))
+
+
+# --- The program ---
+
+
+@pytest.fixture
+def handed(monkeypatch):
+    """What the program hands on to be judged, and to be drawn."""
+    told, drawn = Recorder({"counts": {"missing": 4}}), Recorder()
+    monkeypatch.setattr(program, "judge", told)
+    monkeypatch.setattr(program.plotting, "judge_figure", drawn)
+    monkeypatch.setattr(program, "_print", Recorder())
+    return told, drawn
+
+
+def test_a_quick_look_is_at_the_first_steps_of_each_run(tmp_path, monkeypatch, handed):
+    monkeypatch.setattr(program, "_QUICK", 100)
+    made = drives()
+    truths, estimates, nus = files(tmp_path, made, 2)
+    judged(tmp_path, truths, estimates, innovations=tuple(nus), quick=True)
+    ((arrays, how),) = handed[0].calls
+    for got, expected in zip(arrays, made, strict=False):
+        np.testing.assert_allclose(got, expected[:2, :100], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(how["time"], DT * np.arange(100), rtol=0, atol=1e-9)
+    assert how["valid"].shape == (2, 100)
+    np.testing.assert_allclose(how["innovations"].innovation, made.nu[:2, :100], rtol=0, atol=1e-9)
+
+
+def test_a_gap_of_the_truth_is_as_long_as_the_option_says(tmp_path, handed):
+    truth = csv(tmp_path / "truth.csv", COLUMNS[:4], [(t, 0, 0, 0) for t in (0, 1, 4, 5)])
+    rows = [(t, 0, 0, 0, 1, 0, 0, 1, 0, 1) for t in np.arange(11) / 2]
+    estimate = csv(tmp_path / "estimate.csv", COLUMNS, rows)
+    for gap, valid in ((0.5, 4), (1.0, 6), (3.0, 11)):
+        judged(tmp_path, [truth], [estimate], max_gap=gap)
+        assert handed[0].calls[-1][1]["valid"].sum() == valid
+
+
+def test_what_is_judged_is_named_and_counted(tmp_path, handed):
+    """By the first file and how many more; what was left out by the reader and by the judge."""
+    told, drawn = handed
+    made = drives()
+    truths, estimates, nus = files(tmp_path, made, 3)
+    report = judged(tmp_path, truths, estimates, innovations=tuple(nus), gate=0.9)
+    assert report["estimates"] == [str(path) for path in estimates]
+    assert report["counts"] == {"backward_stamps": 0, "duplicate_stamps": 0, "without_truth": 0, "missing": 4}
+    ((arrays, how),) = told.calls
+    for got, expected in zip(arrays, made, strict=False):
+        np.testing.assert_allclose(got, expected[:3], rtol=0, atol=1e-9)
+    assert how["gate_probability"] == 0.9
+    (((path, same, where, title), _),) = drawn.calls
+    assert (path, same, title) == (tmp_path / "out" / "nees.png", report, "estimate0.csv and 2 more")
+    np.testing.assert_allclose(where, made.truth[0, :, :2], rtol=0, atol=1e-9)
+    judged(tmp_path, truths[:1], estimates[:1])
+    assert drawn.calls[1][0][3] == "estimate0.csv"
+    assert (told.calls[1][1]["innovations"], told.calls[1][1]["gate_probability"]) == (None, None)
+
+
+def test_what_is_shown_of_a_judgement(monkeypatch, capsys):
+    shown = []
+    monkeypatch.setattr(program, "show", lambda *args: shown.append(args))
+    monkeypatch.setattr(program, "print_verdicts", lambda report: None)
+    monkeypatch.setattr(program, "pose_rows", lambda report: [("p", "", "")])
+    monkeypatch.setattr(program, "innovation_rows", lambda report: [("i", "", "")])
+    span = {"side": "over-confident", "from_s": 1.25, "to_s": 2.5, "x_m": (0.5, 1.5), "y_m": (-2, 3), "anees": 9.5}
+    report = {"runs": 2, "steps": 9, "scored_steps": 17, "independent_samples": 12.0, "nees_median": 2.5}
+    report |= {"counts": {"missing": 1, "not_finite": 0}, "dishonest": [span]}
+    program._print(report, "title")
+    program._print(report | {"nis_mean": 2.0}, "title")
+    head = [("runs, steps, steps scored", "2, 9, 17", ""), ("independent samples", "12", "")]
+    head += [("median NEES", "2.5", "2.37"), ("p", "", "")]
+    left = [("dropped or mended in the log: missing", "1", "")]
+    assert shown == [("title", head + left), ("title", [*head, ("i", "", ""), *left])]
+    said = "over-confident from 1.25 to 2.5 s (x 0.5 to 1.5 m, y -2 to 3 m): NEES 9.5"
+    assert said in " ".join(capsys.readouterr().out.split())
 
 
 # --- The figure ---

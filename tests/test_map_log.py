@@ -5,13 +5,17 @@ import math
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
+import reference
+from programs import Recorder
 from test_experiments import is_png
 from test_logs import flaser, refused, write
 
+from jaxlocmap import Params
 from jaxlocmap.mapfile import OCCUPIED, load_map
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
@@ -217,6 +221,112 @@ def test_tuning_maps_in_the_same_frame_and_with_the_same_ranges(tmp_path):
     assert np.all(np.asarray(source.train.poses)[..., :2] < 50)
     first = np.asarray(source.train.inputs.ranges).reshape(-1, 181)[0]
     np.testing.assert_array_equal(first[[0, 90, 91]], [20, np.nan, 2])
+
+
+# --- what the program makes of its options and of the map
+
+
+@pytest.fixture
+def mapped(monkeypatch):
+    """Made without mapping: of which log with which parameters and settings, and what is drawn of it."""
+    seen, drawn = Recorder(), Recorder()
+
+    def stub(params, log, config):
+        seen(params, log, config)
+        log_odds = np.zeros(config.grid.shape, np.float32)
+        log_odds[1, 2], log_odds[0, :3] = 3.0, -2.0
+        return log_odds, 2.0, 0.5
+
+    monkeypatch.setattr(map_log, "_map", stub)
+    monkeypatch.setattr(map_log.plotting, "map_figure", drawn)
+    return seen, drawn
+
+
+def test_the_report_is_that_of_the_map(tmp_path, mapped):
+    ranges = [1.0, 2.0, 5.0, math.inf, math.nan]
+    path = logged(tmp_path, *((ranges, (0.5 * k, 0, 0)) for k in range(6)))
+    report, cells, spec = make(tmp_path, path, resolution=0.25, max_range=5.0, fov=80.0)
+    rows, columns = cells.shape
+    assert spec.resolution == mapped[0].calls[0][0][2].grid.resolution == 0.25
+    assert columns > rows + 4  # the robot drives along x
+    p = 1 / (1 + math.exp(3.0)), 1 / (1 + math.exp(2.0))
+    bits = sum(n * -(q * math.log2(q) + (1 - q) * math.log2(1 - q)) for n, q in zip((1, 3), p, strict=True))
+    assert report["entropy_bits"] == pytest.approx(cells.size - 4 + bits, rel=1e-5)
+    assert {name: report[name] for name in report if name not in ("beams_span_deg", "entropy_bits", "counts")} == {
+        "log": "a.log",
+        "scans": 6,
+        "beams": 5,
+        "beam_angles_from": "user",
+        "max_range": 5.0,
+        "ranges_below_max": 12,
+        "cells": rows * columns,
+        "shape": [rows, columns],
+        "origin": list(spec.origin),
+        "resolution": 0.25,
+        "seen": 4,
+        "occupied": 1,
+        "free": 3,
+        "mapping_s": 2.0,
+        "compile_s": 0.5,
+        "scans_per_s": 3.0,
+    }
+    assert report["beams_span_deg"] == pytest.approx(80)
+    assert cells[1, 2] == OCCUPIED
+    ((_, log_odds, grid, path), how) = mapped[1].calls[0]
+    assert (log_odds.shape, grid, how["title"]) == (cells.shape, spec, "a.log: 6 scans, cells of 0.25 m")
+    np.testing.assert_allclose(path, [[0.5 * k, 0, 0] for k in range(6)], rtol=0, atol=1e-9)
+
+
+def test_options_reach_the_map(tmp_path, mapped, monkeypatch):
+    path = logged(tmp_path, *(([1.0, 2.0, 3.0], (k, 0, 0)) for k in range(6)))
+    monkeypatch.setattr(map_log, "_PIECE", 4)
+    Params.from_std(v=1, w=1, range=1, bearing=1, l_occ=0.5, l_free=-0.25).save(tmp_path / "a.json")
+    make(tmp_path, path)
+    make(tmp_path, path, quick=True, params=tmp_path / "a.json", max_range=2.5)
+    (params, log, config), (other, short, near) = (args for args, _ in mapped[0].calls)
+    assert (float(params.l_occ), float(params.l_free)) == pytest.approx((0.85, -0.4))
+    assert (float(other.l_occ), float(other.l_free)) == pytest.approx((0.5, -0.25))
+    assert (len(log.scan), len(short.scan), len(short.truth)) == (6, 4, 4)
+    assert (config.max_range, near.max_range, config.min_range) == (20, 2.5, 0.05)
+    assert (log.scan.max(), short.scan.max()) == (3, 2.5)
+
+
+def test_a_map_is_made_in_pieces_as_in_one(tmp_path, monkeypatch):
+    """Of five scans in pieces of two, against NumPy: the map goes on; what fills up the last piece marks nothing."""
+    rng = np.random.default_rng(0)
+    angles = np.deg2rad(np.linspace(-60, 60, 7))
+    poses = [(*rng.uniform(-1, 1, 2).round(3), 0.7 * k) for k in range(5)]
+    path = logged(tmp_path, *((room(angles + pose[2], at=pose[:2]).round(3), pose) for pose in poses))
+    monkeypatch.setattr(map_log, "_PIECE", 2)
+    log, spec, config = map_log.ready(map_log.read(path, "carmen", fov=math.radians(120)), 0.25, 4.0)
+    clock = iter([10.0, 12.0, 15.0])
+    monkeypatch.setattr(map_log, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    log_odds, *took = map_log._map(map_log.course_params(), log, config)
+    assert took == [3, 2]  # seconds of mapping, of compiling
+    expected = np.zeros(spec.shape)
+    scan = {"origin": spec.origin, "resolution": 0.25, "l_occ": 0.85, "l_free": -0.4}
+    scan |= {"l_min": config.grid.l_min, "l_max": config.grid.l_max, "min_range": 0.05, "max_range": 4.0}
+    for pose, ranges in zip(poses, log.scan, strict=True):
+        expected = reference.update_scan(expected, np.array(pose), ranges, angles, **scan)
+    assert np.sum(np.abs(log_odds - expected) > 1e-4) <= 2  # where float32 takes a beam through the corner of a cell
+    assert np.sum(expected != 0) > 100
+
+
+@pytest.mark.parametrize(("below", "said"), [(4, True), (5, False)])
+def test_few_ranges_below_the_limit_are_doubtful(tmp_path, capsys, below, said):
+    """Fewer than one in twenty of those that measure anything."""
+    ranges = [1.0] * below + [30.0] * (100 - below) + [math.nan] * 50
+    log = map_log.read(logged(tmp_path, (ranges, (0, 0, 0))), "carmen", fov=3.0)
+    map_log.say_doubts(log, 20.0)
+    assert (f"only {below} of 100 ranges lie below" in capsys.readouterr().out) == said
+
+
+def test_the_grid_holds_everything_with_a_metre_around_it(tmp_path):
+    """On whole cells, rows along y."""
+    path = logged(tmp_path, ([2.0, 3.0, 4.0], (10.1, 20.1, math.pi / 2)))
+    spec = map_log.extent(map_log.read(path, "carmen", fov=math.pi), 0.5)
+    # A beam of 2 m to the right, of 3 m ahead, of 4 m to the left: x from 6.1 to 12.1, y from 20.1 to 23.1.
+    assert (spec.origin, spec.shape) == ((5.0, 19.0), (11, 17))
 
 
 # --- the small cases beside the real data
