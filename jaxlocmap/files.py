@@ -37,8 +37,10 @@ def writing(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.replace(path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None and error.errno:  # as of a full disk
+            error.filename = str(path)
         raise
 
 

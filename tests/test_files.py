@@ -29,7 +29,7 @@ PARAMS = Params.from_std(v=0.1, w=0.1, range=0.1, bearing=0.1)
 def test_a_full_disk_leaves_what_was_there(tmp_path, name, write):
     path = tmp_path / name
     path.write_text("before")
-    with full_disk(room=10), pytest.raises(OSError, match="File too large"):
+    with full_disk(room=10), pytest.raises(OSError, match=f"File too large: '{path}'"):
         write(path)
     assert [file.name for file in tmp_path.iterdir()] == [name]
     assert path.read_text() == "before"
