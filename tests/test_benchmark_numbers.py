@@ -384,8 +384,11 @@ def test_the_course_s_filter_is_the_reference(x64):
         mean, cov = reference.predict(mean, cov, np.array([v, w]), 0.1, Q, reference.capstone, 0.1)
         np.testing.assert_allclose(robot.mean, mean, rtol=0, atol=1e-12)
         np.testing.assert_allclose(robot.cov, cov, rtol=0, atol=1e-12)
-    for z, refused in (((9.2, 1.4), False), ((3.0, 1.4), True), ((6.9, -2.0), True)):
-        landmark = (2.0, 10.0)
+    landmark = (2.0, 10.0)
+    for share, refused in ((0.9, False), (1.1, True), (0.5, False)):  # of the squared distance that the gate lets in
+        expected = reference.expected_observation(mean, np.array(landmark))[0]
+        S = reference.correct(mean, cov, expected, np.array(landmark), R, None)[3]
+        z = expected + np.linalg.cholesky(S) @ np.sqrt([share * 9.21, 0])
         kept = robot.mean.copy()
         robot.correct(*z, landmark)
         mean, cov, *_ = reference.correct(mean, cov, np.array(z), np.array(landmark), R, 9.21)
@@ -408,11 +411,12 @@ def test_the_course_s_grid_and_beams():
     grid.add(pose, np.array([3.0, 0.05]), angles)
     assert grid.log_odds[2, 4] == 4.0  # clamped
     assert grid.log_odds[3, 1] == pytest.approx(-0.4)  # too near is no measurement
+    assert grid.log_odds[2, 1] == pytest.approx(-1.2)
     before = grid.log_odds.copy()
     grid.add(pose, np.array([3.0]), np.array([np.pi]))  # ends outside
     grid.add(np.array([-3.0, 2.5, 0.0]), np.array([2.0]), angles[:1])  # starts outside
     np.testing.assert_array_equal(grid.log_odds, before)
-    room = dataclasses.replace(settings, walls=[(3.0, 0.0, 3.0, 9.0), (2.0, 5.0, 0.0, 5.0)])
+    room = dataclasses.replace(settings, walls=[(3.0, 0.0, 3.0, 9.0), (2.0, 5.0, 0.0, 5.0), (2.0, 3.0, 4.0, 3.0)])
     still = SimpleNamespace(normal=lambda mean, std: 0.0)
     np.testing.assert_allclose(course.scan(pose, angles, room, still), [1.5, 2.5], rtol=0, atol=1e-12)
     assert course.scan(pose, np.array([np.pi]), room, still) == 4.0  # none behind: the limit

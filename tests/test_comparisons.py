@@ -235,13 +235,13 @@ def test_losses_are_compared_from_a_start_three_times_too_sure(monkeypatch, fits
 
 def test_what_a_gradient_costs(monkeypatch):
     """Medians of times taken in turns; the ratio is the median of ratios, not the ratio of medians."""
-    clock = iter(np.cumsum([0, 1, 0, 2, 0, 2, 0, 8, 0, 3, 0, 9] + [0, 2, 0, 6] * 12).tolist())
+    clock = iter(np.cumsum([0, 1, 0, 9, 0, 2, 0, 8, 0, 10, 0, 20] * 5).tolist())
     monkeypatch.setattr(tune_compare.time, "perf_counter", lambda: next(clock))
     monkeypatch.setattr(tune_compare, "_drives", lambda *args: jnp.ones(2))
     monkeypatch.setattr(tune_compare, "_bytes_a_run", lambda steps: 10.0 * steps + 600)
     monkeypatch.setattr(tuning, "coordinates_objective", lambda *_: lambda at, batch: (at["v"] * batch.sum(), {}))
     cost = tune_compare._cost(4, False)
-    assert (cost["value_s"], cost["gradient_s"], cost["gradient_over_value"]) == (2, 6, 3)
+    assert (cost["value_s"], cost["gradient_s"], cost["gradient_over_value"]) == (2, 9, 4)
     assert (cost["bytes_a_run_240"], cost["bytes_a_run_3840"], cost["memory_ratio"]) == (3000, 39000, 13)
 
 
@@ -271,7 +271,7 @@ def test_the_memory_of_a_gradient_is_a_run_s_with_everything(monkeypatch):
     assert (set(at), batch) == ({"v", "w", "range", "bearing", "l_occ", "l_free"}, "batch")
 
 
-def test_the_linear_robot_drives_and_sees_as_it_says(x64):
+def test_the_linear_robot_drives_and_sees_as_it_says(x64, monkeypatch):
     rng = np.random.default_rng(0)
     batch = tune_compare._linear_drives(rng, 40, 50)
     truth, z = np.asarray(batch.truth), np.asarray(batch.inputs.z)[:, :, 0]
@@ -287,6 +287,11 @@ def test_the_linear_robot_drives_and_sees_as_it_says(x64):
     turned = z[..., 1] - (np.arctan2(-truth[..., 1], 1e3 - truth[..., 0]) - truth[..., 2])
     assert np.std(off) == pytest.approx(0.2, rel=0.05)
     assert np.std(turned) == pytest.approx(0.04, rel=0.05)
+    monkeypatch.setattr(tune_compare, "_SEEN", (0.0, 0.0))
+    exact = tune_compare._linear_drives(rng, 2, 50)
+    (x, y, heading), z = np.moveaxis(np.asarray(exact.truth), -1, 0), np.asarray(exact.inputs.z)[:, :, 0]
+    np.testing.assert_allclose(z[..., 0], np.hypot(1e3 - x, y), rtol=1e-12)
+    np.testing.assert_allclose(z[..., 1], np.arctan2(-y, 1e3 - x) - heading, rtol=0, atol=1e-12)
     assert np.all(batch.inputs.dt == 1)
     assert np.all(batch.inputs.valid)
     np.testing.assert_array_equal(batch.landmarks, [[1e3, 0]])
