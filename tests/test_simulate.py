@@ -136,7 +136,7 @@ def test_the_loop_keeps_half_a_metre_from_every_wall_and_comes_back(loops):
     # After the first lap the pull towards the circle has forgotten the start; what is left is the plant's noise.
     assert np.hypot(*(poses[:, -1, :2] - poses[:, lap - 1, :2]).T).max() < 0.5
     turned = np.unwrap(poses[..., 2], axis=1)
-    np.testing.assert_allclose((turned[:, -1] - turned[:, lap - 1]) / (2 * np.pi), 1, atol=0.05)
+    np.testing.assert_allclose((turned[:, -1] - turned[:, lap - 1]) / (2 * np.pi), 1, rtol=0, atol=0.05)
 
 
 # --- Randomness ---
