@@ -161,7 +161,7 @@ def test_the_two_bounds_of_the_log_odds_are_their_own(same):
     same(grid.clamp(jnp.array([-9.0, -0.6, 1.4, 9.0]), spec), [-0.7, -0.6, 1.4, 1.5])
 
 
-any_range = st.one_ofany_range = st.one_of(st.floats(-1.0, 12.0), st.sampled_from([math.nan, math.inf, -math.inf]))
+any_range = st.one_of(st.floats(-1.0, 12.0), st.sampled_from([math.nan, math.inf, -math.inf]))
 coordinate = st.floats(-8.0, 8.0)
 
 
