@@ -180,6 +180,21 @@ def test_a_very_long_beam_is_bresenhams(n):
     np.testing.assert_array_equal(last, np.where(first_outside > n, n, -1))
 
 
+@pytest.mark.usefixtures("x64")
+def test_float32_is_not_asked_for_every_cell_of_a_beam_of_9000():
+    """It would misplace some of these; the reach is no longer than the beams, and float32 counts the map's cells."""
+    n, up = 9_000, np.arange(1, 1_790, 61)
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=(1_800, n + 2))
+    ranges, angles = jnp.array(np.hypot(n, up) * 0.5), jnp.array(np.arctan2(up, n))
+    j = np.arange(n + 1)
+    _, last, (column, row) = some_cells(
+        jnp.array([0.25, 0.25, 0.0]), ranges, angles, jnp.asarray(j[None], jnp.int32), spec=spec, max_range=4_600.0
+    )
+    np.testing.assert_array_equal(last, np.full(len(up), n))
+    np.testing.assert_array_equal(column, np.broadcast_to(j, column.shape))
+    np.testing.assert_array_equal(row, (2 * j * up[:, None] + n - 1) // (2 * n))
+
+
 def test_beams_of_more_cells_than_can_be_counted_are_refused():
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.05, shape=(10, 10))
     with pytest.raises(ValueError, match=r"^max_range: expected beams of up to 1,048,576 cells, got 60000\.0 m"):

@@ -126,6 +126,15 @@ def test_a_threshold_may_be_a_value_of_each_run():
     np.testing.assert_array_equal(update.mean[1], ekf.update(*args).mean)
 
 
+def test_an_observation_exactly_at_the_threshold_is_refused():
+    """Residuals whose distance is exact: S = 4 I, so d² of (2, 4) is 5."""
+    args = [jnp.array(x) for x in (MEAN, 3 * np.eye(3), np.array([2.0, 4.0]), np.eye(2, 3), np.eye(2))]
+    for threshold, accepted in ((5.0, False), (np.nextafter(np.float32(5), np.float32(6)).item(), True)):
+        update = ekf.update(*args, threshold=threshold)
+        assert float(update.nis) == 5
+        assert bool(update.accepted) is accepted
+
+
 @pytest.mark.parametrize("probability", [0.0, 1.0, -1.0, 2.0, math.nan])
 def test_a_gate_that_is_no_probability_is_refused(probability):
     with pytest.raises(ValueError, match=r"gate probability: expected a value inside \(0, 1\), got"):
@@ -193,26 +202,37 @@ def test_a_linear_model_is_the_textbook_kalman_filter(m, tolerance):
         near(got.log_likelihood, density.logpdf(innovation), tolerance(1e-12, 1e-4))
 
 
-def test_an_update_that_is_not_valid_leaves_the_belief_bit_for_bit():
+GATES = pytest.mark.parametrize(
+    "gate", [{"threshold": 9.21}, {"threshold": 9.21, "softness": 2.0}], ids=["hard", "soft"]
+)
+
+
+@GATES
+def test_an_update_that_is_not_valid_leaves_the_belief_bit_for_bit(gate):
     args = [jnp.array(x) for x in (MEAN, COV, np.array([0.1, 0.2]), np.eye(2, 3), R)]
-    update = ekf.update(*args, valid=False)
+    update = ekf.update(*args, valid=False, **gate)
     assert not update.accepted
     np.testing.assert_array_equal(update.mean, args[0])
     np.testing.assert_array_equal(update.cov, args[1])
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_residual_that_is_no_number_never_passes_even_without_a_gate(bad):
+@pytest.mark.parametrize("gate", [{}, {"threshold": 9.21, "softness": 2.0}], ids=["none", "soft"])
+def test_a_residual_that_is_no_number_never_passes_even_without_a_gate(bad, gate):
     args = [jnp.array(x) for x in (MEAN, COV, np.array([bad, 0.2]), np.eye(2, 3), R)]
-    update = ekf.update(*args)
+    update = ekf.update(*args, **gate)
     assert not update.accepted
     np.testing.assert_array_equal(update.mean, args[0])
+    np.testing.assert_array_equal(update.cov, args[1])
 
 
-def test_an_innovation_covariance_that_is_not_definite_never_passes():
-    """R = -9 I makes S negative definite: a residual of zero would have a distance of zero, inside any gate."""
-    args = [jnp.array(x) for x in (MEAN, COV, np.zeros(2), np.eye(2, 3), -9 * np.eye(2))]
-    update = ekf.update(*args, threshold=9.21)
+@GATES
+@pytest.mark.parametrize("variances", [(-9.0, -9.0), (9.0, -9.0), (-9.0, 9.0), (9.0, -COV[1, 1])])
+def test_an_innovation_covariance_that_is_not_definite_never_passes(variances, gate):
+    """A negative one gives a residual of zero a distance of zero, inside any gate; the last one is singular."""
+    args = [jnp.array(x) for x in (MEAN, np.diag(np.diag(COV)), np.zeros(2), np.eye(2, 3), np.diag(variances))]
+    args[2] = args[2] + (0.1 if variances[1] == -COV[1, 1] else 0)
+    update = ekf.update(*args, **gate)
     assert np.isnan(update.nis)
     assert not update.accepted
     np.testing.assert_array_equal(update.mean, args[0])

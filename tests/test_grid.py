@@ -152,6 +152,15 @@ def test_log_odds_are_clamped_both_ways(same):
     same(map_[6, 6], SPEC.l_min)
 
 
+def test_the_two_bounds_of_the_log_odds_are_their_own(same):
+    """That of walls is 1.5 nats, that of free space -0.7."""
+    spec = GridSpec(SPEC.origin, SPEC.resolution, SPEC.shape, l_min=-0.7, l_max=1.5)
+    scene = jnp.array([0.1, 2.1, 0.0]), jnp.full(9, 1.0), jnp.zeros(9)
+    map_ = scanned(jnp.zeros(spec.shape), *scene, spec=spec)
+    same([map_[6, 8], map_[6, 6], map_[5, 6]], [1.5, -0.7, 0])
+    same(grid.clamp(jnp.array([-9.0, -0.6, 1.4, 9.0]), spec), [-0.7, -0.6, 1.4, 1.5])
+
+
 any_range = st.one_of(st.floats(-1.0, 12.0), st.sampled_from([math.nan, math.inf, -math.inf]))
 coordinate = st.floats(-8.0, 8.0)
 
@@ -467,6 +476,11 @@ def test_certain_cells_fall_into_the_last_bins():
     bins = calibration(log_odds, jnp.array([[True, False]]), jnp.ones((1, 2), bool), bins=4)
     np.testing.assert_array_equal(bins.cells, [1, 0, 0, 1])
     assert float(bins.error) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_cell_at_the_edge_of_two_bins_falls_into_the_upper():
+    bins = calibration(jnp.zeros((1, 2)), jnp.array([[True, False]]), jnp.ones((1, 2), bool), bins=4)
+    np.testing.assert_array_equal(bins.cells, [0, 0, 2, 0])
 
 
 # --- course problem 1: the covariance of a beam's end

@@ -99,6 +99,17 @@ def test_a_landmark_on_the_sensor_is_undefined_with_finite_gradients(offset):
     assert all(np.all(np.isfinite(g)) for g in gradients)
 
 
+@pytest.mark.parametrize(("away", "defined"), [(1e-5, False), (1e-4, True), (1e-3, True), (0.05, True)])
+def test_a_landmark_has_a_bearing_unless_it_touches_the_sensor(away, defined):
+    """3e-5 m is where it begins, in squares: 1e-9 m²."""
+    z = jnp.array([away, 0.25])
+    residual, H, there = landmarks.linearise(jnp.zeros(3), jnp.array([0.0, away]), z)
+    assert bool(there) is defined
+    if defined:
+        np.testing.assert_allclose(residual, [0, 0.25 - np.pi / 2], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(H.array(float), [[0, -1, 0], [1 / away, 0, -1]], rtol=1e-5, atol=0)
+
+
 SHAPES = {"pose": (3,), "landmark": (2,), "z": (2,)}
 
 

@@ -111,6 +111,20 @@ def test_a_clearly_negative_eigenvalue_is_seen(seed, scale):
     assert not psd(units @ V @ np.diag([1.0, rng.uniform(0.0, 1.0), -0.01]) @ V.T @ units)
 
 
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 2)])
+def test_a_correlation_beyond_one_is_seen_and_one_of_one_is_none(pair, tolerance):
+    """By more than rounding, 64 units of the last place; also where a second makes the determinant positive."""
+    for beyond, fine in ((-1e-3, True), (0.0, True), (tolerance(1e-13, 1e-4), False), (2.0, False)):
+        for sign in (1, -1):
+            P = np.diag([1.0, 1.0, 1.0])
+            P[pair] = P[pair[::-1]] = sign * (1 + beyond)
+            assert psd(P) == fine
+    assert not psd(np.full((3, 3), 2.0) - np.eye(3))  # eigenvalues 5, -1, -1
+    singular = np.ones((3, 3))
+    singular[pair] = singular[pair[::-1]] = 1 - tolerance(1e-6, 1e-2)  # all minors are fine, the determinant is not
+    assert not psd(singular)
+
+
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("place", [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
 def test_a_matrix_with_an_entry_that_is_no_number_is_refused(bad, place):

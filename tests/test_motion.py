@@ -3,6 +3,7 @@
 import functools
 import math
 import re
+from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -62,6 +63,22 @@ def test_jacobians_are_the_derivatives_of_the_transition(name, tolerance):
     atol = tolerance(1e-14, 2e-6)  # a few roundings of entries of order 1
     np.testing.assert_allclose(F, F_jax, rtol=0, atol=atol)
     np.testing.assert_allclose(G, G_jax, rtol=0, atol=atol)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("share", [1e-3, 0.3, 0.7, 0.97, 0.999])
+def test_the_series_near_no_turn_is_right_to_the_last_digit(share):
+    """Against Taylor's in fractions, sin(h)/h = Σ (-1)ⁿ h²ⁿ / (2n + 1)!: no coefficient is off by a per cent."""
+    h = share * SWITCH
+    terms = [(2 * n, Fraction((-1) ** n, math.factorial(2 * n + 1))) for n in range(12)]
+    exact = float(sum(c * Fraction(h) ** power for power, c in terms))
+    slope = float(sum(power * c * Fraction(h) ** (power - 1) for power, c in terms if power))
+    for sign in (1, -1):
+        got, got_slope = motion._sinc(jnp.array(sign * h))
+        assert float(got) == pytest.approx(exact, rel=0, abs=2.3e-16)
+        assert float(got_slope) == pytest.approx(
+            sign * slope, rel=0, abs=5e-16
+        )  # the first term left out, at the switch
 
 
 def test_from_transition_predicts_as_the_analytic_model(tolerance):
@@ -193,6 +210,9 @@ def test_a_faster_right_wheel_turns_left():
 def test_a_gyro_takes_the_place_of_the_wheels_yaw_rate():
     control = motion.from_wheels(jnp.array([0.4]), jnp.array([0.6]), 0.5, gyro=jnp.array([-0.1]))
     np.testing.assert_allclose(control, [[0.5, -0.1]], rtol=1e-6)
+    wheels = jnp.array([0.2, 0.4]), jnp.array([0.4, 0.8])
+    shared = motion.from_wheels(*wheels, 0.5, gyro=jnp.array(0.3))
+    np.testing.assert_allclose(shared, [[0.3, 0.3], [0.6, 0.3]], rtol=1e-6)
 
 
 @pytest.mark.parametrize("base", [0.0, -0.3, math.nan])

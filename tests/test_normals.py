@@ -56,6 +56,16 @@ def test_every_key_of_jax_has_words_of_its_own(kind):
     np.testing.assert_array_equal(np.ravel(normals.words_of(keys[7])), every[7])  # alone as in a batch
 
 
+@pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
+def test_every_word_of_a_key_matters_to_both_of_its_words(kind):
+    data = np.arange(1, 1 + jax.random.key_data(jax.random.key(0, impl=kind)).size, dtype=np.uint32)
+    every = np.array([data, *(data + 2**31 * np.eye(data.size, dtype=np.uint32))], np.uint32)
+    got = np.array([normals.words_of(jax.random.wrap_key_data(jnp.array(each), impl=kind)) for each in every])
+    assert all(len(np.unique(column)) == len(every) for column in got.T)
+    np.testing.assert_array_equal(normals.words_of(jnp.array(data)), got[0])  # as a plain array
+
+
+# --- Streams ---
 # --- Streams ---
 
 

@@ -156,6 +156,10 @@ def test_a_grid_that_cannot_be_is_refused(change, message):
             ({"gate_probability": p}, rf"gate_probability: expected a probability inside \(0, 1\).*got {p}")
             for p in (0.0, 1.0, -1.0, 2.0, math.nan)
         ),
+        *(
+            ({"gate_softness": s}, rf"gate_softness: expected a finite width >= 0, got {s}")
+            for s in (-1.0, math.inf, math.nan)
+        ),
         ({"sensor_offset": (0.1, 0.2)}, r"sensor_offset: expected finite \(dx, dy, dtheta\), got \(0\.1, 0\.2\)"),
         ({"sensor_offset": (0.1, 0.2, math.inf)}, r"sensor_offset: expected .* got \(0\.1, 0\.2, inf\)"),
         ({"min_range": -0.1}, r"min_range, max_range: expected 0 <= min_range < max_range, got -0\.1, 8\.0"),
@@ -216,6 +220,12 @@ def test_dtype_checks_see_through_jit():
         (GridSpec, {"shape": 5}, "shape: expected a tuple of numbers, got 5"),
         (GridSpec, {"origin": ("0", 1.0)}, "origin: expected a number, got '0'"),
         (Config, {"dt": None}, "dt: expected a number, got None"),
+        (Config, {"dt": True}, "dt: expected a number, got True"),
+        (Config, {"gate_softness": "2"}, "gate_softness: expected a number, got '2'"),
+        (Config, {"min_range": None}, "min_range: expected a number, got None"),
+        (Config, {"max_range": [8.0]}, r"max_range: expected a number, got \[8\.0\]"),
+        (GridSpec, {"l_min": None}, "l_min: expected a number, got None"),
+        (GridSpec, {"l_max": "4"}, "l_max: expected a number, got '4'"),
         (Config, {"gate_probability": "0.99"}, r"gate_probability: expected a number, got '0\.99'"),
         (Config, {"sensor_offset": 0.2}, r"sensor_offset: expected a tuple of numbers, got 0\.2"),
     ],

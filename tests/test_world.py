@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+import scipy.stats
 
 from jaxlocmap import GridSpec, world
 from jaxlocmap.world import World, room
@@ -23,6 +24,28 @@ def test_the_room_is_the_course_s():
     np.testing.assert_allclose(here.segments, expected)
 
 
+def test_a_random_room_has_its_box_anywhere_half_a_metre_from_the_walls(tolerance):
+    """Sides of 1 to 4 m. Both sides and both places are even over what they may be, and independent."""
+    count, plain = 4_000, room()
+    rooms = jax.jit(jax.vmap(world.random_room))(jax.random.split(jax.random.key(0), count))
+    np.testing.assert_array_equal(rooms.landmarks, np.broadcast_to(plain.landmarks, (count, 4, 2)))
+    np.testing.assert_array_equal(rooms.segments[:, :4], np.broadcast_to(plain.segments[:4], (count, 4, 2, 2)))
+    box = np.asarray(rooms.segments[:, 4:], float)
+    low, high = box.min((1, 2)), box.max((1, 2))
+    (x0, y0), (x1, y1) = low.T, high.T
+    ring = np.stack([np.stack(corner, -1) for corner in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))], 1)
+    np.testing.assert_array_equal(box, np.stack([ring, np.roll(ring, -1, axis=1)], 2))
+    size, gap = high - low, tolerance(1e-12, 1e-5)
+    shares = np.concatenate([(size - 1) / 3, (low - 0.5) / (11 - size)], axis=1)  # width, height, place along x and y
+    assert shares.min() > -gap
+    assert shares.max() < 1 + gap
+    for share in shares.T:
+        assert scipy.stats.kstest(share, "uniform").statistic < np.sqrt(np.log(2 / 1e-6) / 2 / count)
+    related = np.corrcoef(shares.T) - np.eye(4)
+    assert np.abs(related).max() < scipy.stats.norm.isf(1e-6 / 2) / np.sqrt(count)
+
+
+# --- What a laser sees ---
 # --- What a laser sees ---
 
 
@@ -77,6 +100,27 @@ def test_a_beam_along_a_wall_and_a_world_without_walls_hit_nothing():
     assert ray_cast(pose, ahead, jnp.zeros((0, 2, 2)), 8.0) == 8.0
 
 
+@pytest.mark.parametrize(
+    ("wall", "distance"),
+    [
+        ([(3.0, 1.0), (3.0, 2.0)], 2.0),  # onto its first end, exactly
+        ([(3.0, 0.0), (3.0, 1.0)], 2.0),  # onto its last
+        ([(3.0, 1.0 + 1e-4), (3.0, 2.0)], 8.0),  # just past it
+        ([(3.0, 0.0), (3.0, 1.0 - 1e-4)], 8.0),
+        ([(1.0, 0.0), (1.0, 2.0)], 0.0),  # the robot stands at the wall
+        ([(1.0 - 1e-4, 0.0), (1.0 - 1e-4, 2.0)], 8.0),  # or just before it
+        ([(2.0, 1.0 - 1e-5), (4.0, 1.0 + 1e-5)], 2.0),  # all but along the beam
+        ([(2.0, 1.0), (4.0, 1.0)], 8.0),  # seen edge on
+        ([(9.0, 0.0), (9.0, 2.0)], 8.0),  # at the very end of its reach
+        ([(8.9, 0.0), (8.9, 2.0)], 7.9),
+    ],
+)
+def test_a_beam_that_all_but_misses_a_wall(wall, distance, tolerance):
+    got = ray_cast(jnp.array([1.0, 1.0, 0.0]), jnp.array([0.0]), jnp.array([wall]), 8.0)
+    np.testing.assert_allclose(got, [distance], rtol=0, atol=tolerance(1e-9, 2e-2))
+
+
+# --- The true map ---
 # --- The true map ---
 
 
