@@ -301,6 +301,45 @@ def test_a_soft_gate_is_an_update_with_r_over_w(residual, tolerance):
     assert bool(got.accepted) == (nis < threshold)
 
 
+@pytest.mark.parametrize("softness", [0.0, 2.0])
+def test_an_observation_on_the_very_threshold_is_outside(softness):
+    """S = 4 I and r = (6, 0): a distance of 9, exactly."""
+    args = [jnp.array(x) for x in (np.zeros(3), np.eye(3), [6.0, 0.0], np.eye(2, 3), 3 * np.eye(2))]
+    for threshold, accepted in ((9.0, False), (np.nextafter(np.float32(9), np.float32(10)), True)):
+        update = ekf.update(*args, threshold=float(threshold), softness=softness)
+        assert float(update.nis) == 9
+        assert bool(update.accepted) is accepted
+    # On it an observation weighs half: R becomes 6 I, and the gain 1 / 7.
+    if softness:
+        half = ekf.update(*args, threshold=9.0, softness=softness)
+        np.testing.assert_allclose(half.mean, [6 / 7, 0, 0], rtol=1e-6)
+        np.testing.assert_allclose(half.cov, np.diag([6 / 7, 6 / 7, 1]), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("fault", "nis"), [("valid", 9.0), ("residual", math.nan), ("R", math.nan), ("cov", math.nan)])
+def test_a_soft_gate_leaves_the_belief_where_there_is_nothing_to_weigh(fault, nis):
+    """An empty slot, a residual that is no number, and covariances of the innovation that are not definite."""
+    mean, cov, residual, R = np.array([0.1, 0.2, 0.3]), np.eye(3), np.array([6.0, 0.0]), 3 * np.eye(2)
+    if fault == "residual":
+        residual[1] = math.nan
+    if fault == "R":
+        R = -9 * np.eye(2)
+    if fault == "cov":
+        cov = np.diag([1.0, -9.0, 1.0])
+    args = [jnp.array(x) for x in (mean, cov, residual, np.eye(2, 3), R)]
+    update = ekf.update(*args, threshold=9.5, softness=2.0, valid=fault != "valid")
+    np.testing.assert_array_equal(update.mean, args[0])
+    np.testing.assert_array_equal(update.cov, args[1])
+    assert not update.accepted
+    np.testing.assert_array_equal(update.nis, nis)
+
+
+def test_a_soft_gate_that_is_no_gate_is_none():
+    args = [jnp.array(x) for x in (MEAN, COV, np.array([40.0, 1.0]), np.eye(2, 3), R)]
+    for got, expected in zip(ekf.update(*args, softness=2.0), ekf.update(*args), strict=True):
+        np.testing.assert_array_equal(got, expected)
+
+
 # --- course problem 2: a Joseph update of a positive semi-definite matrix is one
 
 joseph = jax.jit(lambda P, H, R: ekf.update(jnp.zeros(3), P, jnp.zeros(len(R)), H, R).cov)

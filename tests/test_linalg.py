@@ -126,3 +126,23 @@ def test_a_negative_variance_is_refused(diagonal):
 
 def test_no_uncertainty_at_all_is_semi_definite():
     assert psd(np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("place", [(0, 1), (0, 2), (1, 2)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_correlation_beyond_one_by_more_than_rounding_is_seen(place, sign, tolerance):
+    beyond = tolerance(1e-12, 1e-4)
+    for excess, fine in ((-beyond, True), (0, True), (beyond, False)):
+        P = np.diag([4.0, 1.0, 0.25])
+        P[place] = P[place[::-1]] = sign * (1 + excess) * np.sqrt(P[place[0], place[0]] * P[place[1], place[1]])
+        assert psd(P) is fine
+
+
+@pytest.mark.parametrize("signs", [(-1, -1, -1), (-1, 1, 1), (1, -1, 1), (1, 1, -1)])
+def test_a_determinant_below_zero_by_more_than_rounding_is_seen(signs, tolerance):
+    """Correlations of a half whose product is negative leave an eigenvalue of zero; no two of them show more."""
+    beyond, place = tolerance(1e-12, 1e-4), ([0, 0, 1], [1, 2, 2])
+    for half, fine in ((0.5 - beyond, True), (0.5, True), (0.5 + beyond, False)):
+        P = np.eye(3)
+        P[place] = P[place[::-1]] = np.array(signs) * half
+        assert psd(P) is fine

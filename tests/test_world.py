@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+import scipy.stats
 
 from jaxlocmap import GridSpec, world
 from jaxlocmap.world import World, room
@@ -75,6 +76,49 @@ def test_a_beam_along_a_wall_and_a_world_without_walls_hit_nothing():
     pose, ahead = jnp.array([1.0, 1.0, 0.0]), jnp.array([0.0])
     assert ray_cast(pose, ahead, along, 8.0) == 8.0
     assert ray_cast(pose, ahead, jnp.zeros((0, 2, 2)), 8.0) == 8.0
+
+
+@pytest.mark.parametrize(
+    ("wall", "pose", "expected"),
+    [
+        ([(2.0, 0.0), (2.0, 3.0)], (0.0, 0.0, 0.0), 2.0),  # its first end
+        ([(2.0, -3.0), (2.0, 0.0)], (0.0, 0.0, 0.0), 2.0),  # its last
+        ([(2.0, 1e-4), (2.0, 3.0)], (0.0, 0.0, 0.0), 8.0),  # just beside
+        ([(2.0, -3.0), (2.0, -1e-4)], (0.0, 0.0, 0.0), 8.0),
+        ([(2.0, 0.0), (3.0, 0.0)], (0.0, 0.0, 0.0), 8.0),  # edge on
+        ([(2.0, -1e-4), (3.0, 1e-4)], (0.0, 0.0, 0.0), 2.5),  # all but
+        ([(3.0, -1e-4), (2.0, 1e-4)], (0.0, 0.0, 0.0), 2.5),
+        ([(0.0, -1.0), (0.0, 1.0)], (0.0, 0.0, 0.0), 0.0),  # the robot stands on it
+        ([(-1e-3, -1.0), (-1e-3, 1.0)], (0.0, 0.0, 0.0), 8.0),  # and just before it, looking away
+        ([(8.5, -1.0), (8.5, 1.0)], (0.0, 0.0, 0.0), 8.0),  # out of reach
+    ],
+)
+def test_where_a_beam_just_meets_a_wall_and_where_it_just_does_not(wall, pose, expected):
+    got = ray_cast(jnp.array(pose), jnp.zeros(1), jnp.array([wall]), 8.0)
+    assert float(got[0]) == pytest.approx(expected, abs=1e-4)
+
+
+# --- Rooms drawn at random ---
+
+
+def test_a_random_room_s_box_has_sides_of_1_to_4_m_half_a_metre_or_more_from_the_walls():
+    """Each of its four numbers is drawn for itself, evenly between its bounds."""
+    count, plain = 2000, room()
+    rooms = jax.jit(jax.vmap(world.random_room))(jax.random.split(jax.random.key(0), count))
+    np.testing.assert_array_equal(rooms.landmarks, np.broadcast_to(plain.landmarks, (count, 4, 2)))
+    np.testing.assert_array_equal(rooms.segments[:, :4], np.broadcast_to(plain.segments[:4], (count, 4, 2, 2)))
+    box = np.asarray(rooms.segments[:, 4:], np.float64)
+    np.testing.assert_array_equal(box[:, :, 1], np.roll(box[:, :, 0], -1, axis=1))  # its walls close
+    low, high = box[:, :, 0].min(1), box[:, :, 0].max(1)
+    corners = np.stack([low, np.stack([high[:, 0], low[:, 1]], 1), high, np.stack([low[:, 0], high[:, 1]], 1)], 1)
+    np.testing.assert_array_equal(box[:, :, 0], corners)
+    share = np.column_stack([(high - low - 1) / 3, (low - 0.5) / (11 - (high - low))])
+    assert -1e-5 < share.min() < 0.01
+    assert 0.99 < share.max() < 1 + 1e-5
+    for values in share.T:
+        assert scipy.stats.kstest(values, "uniform").pvalue > 1e-6
+    # Of 2000 rooms a correlation has a standard error of 0.022.
+    assert np.abs(np.corrcoef(share.T) - np.eye(4)).max() < 5 * 0.0224
 
 
 # --- The true map ---
