@@ -130,10 +130,13 @@ def test_no_uncertainty_at_all_is_semi_definite():
 
 @pytest.mark.parametrize("place", [(0, 1), (0, 2), (1, 2)])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_correlation_beyond_one_by_more_than_rounding_is_seen(place, sign, tolerance):
+@pytest.mark.parametrize("other", [1.0, 0.0])
+def test_a_correlation_beyond_one_by_more_than_rounding_is_seen(place, sign, other, tolerance):
+    """Also where the third variance is zero, and with it the determinant whatever the two are."""
     beyond = tolerance(1e-12, 1e-4)
     for excess, fine in ((-beyond, True), (0, True), (beyond, False)):
         P = np.diag([4.0, 1.0, 0.25])
+        P[3 - sum(place), 3 - sum(place)] *= other
         P[place] = P[place[::-1]] = sign * (1 + excess) * np.sqrt(P[place[0], place[0]] * P[place[1], place[1]])
         assert psd(P) is fine
 
