@@ -101,7 +101,7 @@ def test_a_study_counts_the_devices_and_resumed_runs_of_all_processes(monkeypatc
 
 def test_a_process_with_another_study_is_named(monkeypatch):
     played(monkeypatch, lambda value: [value, value, value + 1 if value.dtype == np.int64 else value], processes=3)
-    with pytest.raises(ValueError, match="^processes: expected the same study in all, process 2 has another$"):
+    with pytest.raises(ValueError, match=r"^processes: expected the same study in all, process 2 has another$"):
         monte_carlo(lambda key: jnp.zeros(()), jax.random.key(0), 3, chunk=1)
 
 
@@ -138,7 +138,7 @@ def test_who_has_joined_stays_so(initialized, monkeypatch):
 
 def test_process_0_alone_needs_the_port(initialized):
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        where = "127.0.0.1:{}".format(taken.getsockname()[1])
+        where = f"127.0.0.1:{taken.getsockname()[1]}"
         with pytest.raises(ConnectionError, match=r"^coordinator: expected a free port to listen at, got \d+: "):
             hosts.join(where, 2, 0)
         hosts.join(where, 2, 1)
@@ -168,12 +168,10 @@ def test_what_jax_says_is_told_in_words(monkeypatch, raised, error, message):
 def test_who_does_not_come_in_time_is_told(monkeypatch):
     late = threading.Event()
     monkeypatch.setattr(jax.distributed, "initialize", lambda *args, **kwargs: late.wait(5))
-    with pytest.raises(
-        TimeoutError, match=r"^distributed: expected the processes of this cluster to meet within 0\.01"
-    ):
+    with pytest.raises(TimeoutError, match=r"^distributed: expected the processes of this cluster to meet within"):
         hosts.join(timeout=0.01)
     with socket.create_server(("127.0.0.1", 0)) as there:
-        where = "127.0.0.1:{}".format(there.getsockname()[1])
+        where = f"127.0.0.1:{there.getsockname()[1]}"
         with pytest.raises(TimeoutError, match=f"^processes: expected 2 to meet at {re.escape(where)} within 0.01 s"):
             hosts.join(where, 2, 1, timeout=0.01)
     late.set()
