@@ -321,6 +321,24 @@ def test_a_soft_gate_is_an_update_with_r_over_w(residual, tolerance):
     assert bool(got.accepted) == (nis < threshold)
 
 
+@pytest.mark.parametrize(("fault", "nis"), [("valid", 9.0), ("residual", math.nan), ("R", math.nan), ("cov", math.nan)])
+def test_a_soft_gate_leaves_the_belief_where_there_is_nothing_to_weigh(fault, nis):
+    """An empty slot, a residual that is no number, and covariances of the innovation that are not definite."""
+    mean, cov, residual, R = np.array([0.1, 0.2, 0.3]), np.eye(3), np.array([6.0, 0.0]), 3 * np.eye(2)
+    if fault == "residual":
+        residual[1] = math.nan
+    if fault == "R":
+        R = -9 * np.eye(2)
+    if fault == "cov":
+        cov = np.diag([1.0, -9.0, 1.0])
+    args = [jnp.array(x) for x in (mean, cov, residual, np.eye(2, 3), R)]
+    update = ekf.update(*args, threshold=9.5, softness=2.0, valid=fault != "valid")
+    np.testing.assert_array_equal(update.mean, args[0])
+    np.testing.assert_array_equal(update.cov, args[1])
+    assert not update.accepted
+    np.testing.assert_array_equal(update.nis, nis)
+
+
 # --- course problem 2: a Joseph update of a positive semi-definite matrix is one
 
 joseph = jax.jit(lambda P, H, R: ekf.update(jnp.zeros(3), P, jnp.zeros(len(R)), H, R).cov)

@@ -99,15 +99,20 @@ def test_a_landmark_on_the_sensor_is_undefined_with_finite_gradients(offset):
     assert all(np.all(np.isfinite(g)) for g in gradients)
 
 
-@pytest.mark.parametrize(("away", "defined"), [(1e-5, False), (1e-4, True), (1e-3, True), (0.05, True)])
-def test_a_landmark_has_a_bearing_unless_it_touches_the_sensor(away, defined):
-    """3e-5 m is where it begins, in squares: 1e-9 m²."""
-    z = jnp.array([away, 0.25])
-    residual, H, there = landmarks.linearise(jnp.zeros(3), jnp.array([0.0, away]), z)
-    assert bool(there) is defined
-    if defined:
-        np.testing.assert_allclose(residual, [0, 0.25 - np.pi / 2], rtol=0, atol=1e-6)
-        np.testing.assert_allclose(H.array(float), [[0, -1, 0], [1 / away, 0, -1]], rtol=1e-5, atol=0)
+@pytest.mark.parametrize(
+    ("distance", "there"), [(0.0, False), (3.1e-5, False), (3.2e-5, True), (1e-4, True), (1e-3, True), (0.05, True)]
+)
+def test_a_landmark_has_a_bearing_from_a_thirtieth_of_a_millimetre_on(distance, there, tolerance):
+    """Where it has none the Jacobian is that of one a metre ahead along x."""
+    pose, angle = jnp.array([0.0, 0.0, 0.3]), 2.0
+    landmark = distance * np.array([np.cos(angle), np.sin(angle)])
+    residual, H, defined = landmarks.linearise(pose, jnp.array(landmark), jnp.array([1.0, 0.5]))
+    assert bool(defined) is there
+    r, angle = (distance, angle) if there else (1.0, 0.0)
+    c, s = np.cos(angle), np.sin(angle)
+    rtol = tolerance(1e-12, 1e-5)
+    np.testing.assert_allclose(residual, [1 - r, 0.5 - angle + 0.3], rtol=rtol)
+    np.testing.assert_allclose(H.array(pose.dtype), [[-c, -s, 0], [s / r, -c / r, -1]], rtol=rtol, atol=0)
 
 
 SHAPES = {"pose": (3,), "landmark": (2,), "z": (2,)}

@@ -111,20 +111,6 @@ def test_a_clearly_negative_eigenvalue_is_seen(seed, scale):
     assert not psd(units @ V @ np.diag([1.0, rng.uniform(0.0, 1.0), -0.01]) @ V.T @ units)
 
 
-@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 2)])
-def test_a_correlation_beyond_one_is_seen_and_one_of_one_is_none(pair, tolerance):
-    """By more than rounding, 64 units of the last place; also where a second makes the determinant positive."""
-    for beyond, fine in ((-1e-3, True), (0.0, True), (tolerance(1e-13, 1e-4), False), (2.0, False)):
-        for sign in (1, -1):
-            P = np.diag([1.0, 1.0, 1.0])
-            P[pair] = P[pair[::-1]] = sign * (1 + beyond)
-            assert psd(P) == fine
-    assert not psd(np.full((3, 3), 2.0) - np.eye(3))  # eigenvalues 5, -1, -1
-    singular = np.ones((3, 3))
-    singular[pair] = singular[pair[::-1]] = 1 - tolerance(1e-6, 1e-2)  # all minors are fine, the determinant is not
-    assert not psd(singular)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("place", [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)])
 def test_a_matrix_with_an_entry_that_is_no_number_is_refused(bad, place):
@@ -140,3 +126,26 @@ def test_a_negative_variance_is_refused(diagonal):
 
 def test_no_uncertainty_at_all_is_semi_definite():
     assert psd(np.zeros((3, 3)))
+
+
+@pytest.mark.parametrize("place", [(0, 1), (0, 2), (1, 2)])
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("other", [1.0, 0.0])
+def test_a_correlation_beyond_one_by_more_than_rounding_is_seen(place, sign, other, tolerance):
+    """Also where the third variance is zero, and with it the determinant whatever the two are."""
+    beyond = tolerance(1e-12, 1e-4)
+    for excess, fine in ((-beyond, True), (0, True), (beyond, False)):
+        P = np.diag([4.0, 1.0, 0.25])
+        P[3 - sum(place), 3 - sum(place)] *= other
+        P[place] = P[place[::-1]] = sign * (1 + excess) * np.sqrt(P[place[0], place[0]] * P[place[1], place[1]])
+        assert psd(P) is fine
+
+
+@pytest.mark.parametrize("signs", [(-1, -1, -1), (-1, 1, 1), (1, -1, 1), (1, 1, -1)])
+def test_a_determinant_below_zero_by_more_than_rounding_is_seen(signs, tolerance):
+    """Correlations of a half whose product is negative leave an eigenvalue of zero; no two of them show more."""
+    beyond, place = tolerance(1e-12, 1e-4), ([0, 0, 1], [1, 2, 2])
+    for half, fine in ((0.5 - beyond, True), (0.5, True), (0.5 + beyond, False)):
+        P = np.eye(3)
+        P[place] = P[place[::-1]] = np.array(signs) * half
+        assert psd(P) is fine

@@ -91,6 +91,18 @@ def test_from_transition_predicts_as_the_analytic_model(tolerance):
         np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance(1e-15, 1e-7))
 
 
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("h", [0.0, 1e-8, 1e-3, 0.1, 0.2, 0.2499999, 0.25, 0.2500001, 1.0, 2.0])
+def test_sinc_and_its_slope_are_the_power_series(h):
+    """Every coefficient: sin(h)/h = Σ (-1)ⁿ h²ⁿ / (2n + 1)!. What is cut off the slope is 1e-14 of it."""
+    terms = [(-1) ** n * h ** (2 * n) / math.factorial(2 * n + 1) for n in range(20)]
+    slopes = [(-1) ** n * 2 * n * h ** (2 * n - 1) / math.factorial(2 * n + 1) for n in range(1, 20)]
+    for sign in (1, -1):
+        value, slope = motion._sinc(jnp.array(sign * h))
+        assert float(value) == pytest.approx(math.fsum(terms), rel=2e-15, abs=0)
+        assert float(slope) == pytest.approx(sign * math.fsum(slopes), rel=2e-14, abs=0)
+
+
 SHAPES = {"pose": (3,), "control": (2,), "dt": ()}
 
 
@@ -160,6 +172,12 @@ def test_wrap_leaves_an_angle_inside_as_it_is(angle):
 @pytest.mark.parametrize("angle", [-EDGE, EDGE, np.nextafter(EDGE, 0), 3 * EDGE, -3 * EDGE, 5 * EDGE, -7 * EDGE])
 def test_wrap_at_the_seam_is_pi_from_zero(angle):
     assert abs(abs(float(motion.wrap(jnp.array(angle)))) - EDGE) <= ulps(8)  # 7 pi carries 8 roundings of pi
+
+
+def test_the_circle_is_closed_at_minus_pi_and_open_at_pi():
+    for angle in (-EDGE, EDGE):
+        assert float(motion.wrap(jnp.array(angle))) == pytest.approx(-EDGE, abs=ulps(1))
+    assert float(motion.wrap(jnp.array(EDGE - ulps(4)))) > 3
 
 
 def test_wrap_has_derivative_one_everywhere():

@@ -118,7 +118,7 @@ def test_the_scenario_holds_the_course_s_constants():
     assert CAPSTONE.config(grid=False).grid is None
 
 
-OTHER = Scenario(
+MADE_UP = Scenario(
     name="other",
     steps=7,
     command=lambda k, pose: jnp.stack([1.0 + 0 * pose[0], 2.0 + 0 * pose[0]]),
@@ -138,65 +138,21 @@ OTHER = Scenario(
 
 def test_a_scenario_of_other_numbers_is_what_it_says():
     """Those of the filter's settings as well; nothing here is a default."""
-    np.testing.assert_allclose(OTHER.prior().mean, [1, 2, 3])
-    np.testing.assert_allclose(OTHER.prior().cov, np.diag([0.01, 0.04, 0.09]), rtol=1e-6)
-    np.testing.assert_allclose(OTHER.beam_angles(), [-0.6, -0.3, 0, 0.3, 0.6], rtol=0, atol=1e-7)
-    assert [bool(OTHER.looks(k)) for k in range(7)] == [True, False, False, True, False, False, True]
+    np.testing.assert_allclose(MADE_UP.prior().mean, [1, 2, 3])
+    np.testing.assert_allclose(MADE_UP.prior().cov, np.diag([0.01, 0.04, 0.09]), rtol=1e-6)
+    np.testing.assert_allclose(MADE_UP.beam_angles(), [-0.6, -0.3, 0, 0.3, 0.6], rtol=0, atol=1e-7)
+    assert [bool(MADE_UP.looks(k)) for k in range(7)] == [True, False, False, True, False, False, True]
     expected = Config(
         dt=0.25,
         motion="euler",
         gate_probability=0.9,
         sensor_offset=(0.1, 0.2, 0.3),
-        grid=OTHER.grid,
+        grid=MADE_UP.grid,
         min_range=0.4,
         max_range=3.0,
     )
-    assert OTHER.config(motion="euler", gate_probability=0.9) == expected
-    assert OTHER.config(grid=False) == dataclasses.replace(expected, motion="arc", gate_probability=0.99, grid=None)
-
-
-def test_a_step_of_another_length_and_a_reach_of_another(tolerance):
-    """Without noise: v dt ahead, omega dt round; a landmark at 2.5 m is not nearer than that."""
-    pose, quiet = jnp.array([1.0, 2.0, 3.0]), Noise(*[0.0] * 7)
-    moved, control = simulate.drive(jnp.ones(3), jnp.array(0), pose, quiet, scenario=OTHER)
-    expected = [1 + 0.25 * math.cos(3), 2 + 0.25 * math.sin(3), 3.5 - 2 * math.pi]
-    np.testing.assert_allclose(moved, expected, rtol=0, atol=tolerance(1e-14, 1e-6))
-    np.testing.assert_array_equal(control, [1, 2])
-    centred, at = dataclasses.replace(OTHER, sensor_offset=(0.0, 0.0, 0.0)), jnp.zeros(3)
-    for away, seen in ((2.5, False), (2.4999, True)):
-        z, near = simulate.sight(jnp.ones(2), at, jnp.array([away, 0.0]), quiet, scenario=centred)
-        assert (bool(near), float(z[0])) == (seen, pytest.approx(away))
-
-
-def test_a_scan_reads_from_the_least_range_up_to_the_reach_and_noise_on_it():
-    """Walls all round at 0.2 m, or none; the noise of a beam is that beam's own."""
-    box = jnp.array([[[-0.2, -9.0], [-0.2, 9.0]], [[0.2, -9.0], [0.2, 9.0]]])
-    draws = jnp.array([-1.0, 0.0, 1.0, 2.0, -2.0])
-    for walls, expected in ((box, 0.4), (box + 50, 3 + 0.5 * np.asarray(draws))):
-        here = World(walls, jnp.zeros((0, 2)))
-        noise = Noise(scan=0.5 if walls is not box else 0.0)
-        got = simulate.look_round(draws, jnp.zeros(3), here, noise, scenario=OTHER)
-        np.testing.assert_allclose(got, np.broadcast_to(expected, 5), rtol=1e-6)
-
-
-def test_a_robot_s_own_noise_has_the_heading_s_as_a_yaw_rate():
-    """0.3 rad a step of 0.5 s is 0.6 rad/s beside the 0.8 of the gyro: together 1."""
-    noise = Noise(heading=0.3, v=0.2, w=0.8, range=0.5, bearing=0.1, scan=9.0, outlier_rate=0.4)
-    params = simulate.own_params(noise, 0.5)
-    np.testing.assert_allclose(params.Q, np.diag([0.04, 1.0]), rtol=1e-6)
-    np.testing.assert_allclose(params.R, np.diag([0.25, 0.01]), rtol=1e-6)
-
-
-def test_the_loop_is_a_circle_of_three_metres_round_the_box(loops):
-    """Counter-clockwise, 600 steps a lap. A heading noise of 0.005 rad a step, which the steering undoes within some
-    20 steps, moves it by centimetres.
-    """
-    lap = np.asarray(loops[0].pose)[:, -600:]
-    x, y = lap[..., 0] - 6.0, lap[..., 1] - 5.4
-    assert np.hypot(x, y).mean() == pytest.approx(3, abs=0.03)
-    np.testing.assert_allclose([x.mean(), y.mean()], 0, rtol=0, atol=0.05)
-    assert np.all(np.diff(np.unwrap(np.arctan2(y, x), axis=1).mean(0)) > 0)
-    assert (LOOP.steps, LOOP.exact_prior, CAPSTONE.exact_prior) == (1200, False, True)
+    assert MADE_UP.config(motion="euler", gate_probability=0.9) == expected
+    assert MADE_UP.config(grid=False) == dataclasses.replace(expected, motion="arc", gate_probability=0.99, grid=None)
 
 
 def test_the_capstone_s_path_crosses_the_box(capstones):
@@ -459,6 +415,106 @@ def test_a_detector_at_the_centre_costs_nothing():
     assert sorted(eqn.primitive.name for eqn in ours.eqns) == sorted(
         eqn.primitive.name for eqn in jax.make_jaxpr(centred)(*args).eqns
     )
+
+
+# --- Another robot than the course's ---
+
+OTHER = dataclasses.replace(
+    SHORT, name="other", steps=6, dt=0.25, sight_range=3.0, sight_period=3, half_view=0.4, max_range=2.0, min_range=0.3
+)
+
+
+def test_a_drive_goes_by_the_robot_s_own_period_reach_and_looks(tolerance):
+    """Without noise: a step of a quarter of a second, looks at steps 0 and 3 up to 3 m, a scan up to 2 m."""
+    scenario = dataclasses.replace(OTHER, command=lambda k, pose: jnp.stack([1.0 + 0 * pose[0], 0.4 + 0 * pose[0]]))
+    none = Noise(*[0.0] * len(Noise._fields))
+    draws = simulate.Draws(jnp.ones((6, 3)), jnp.ones((6, 4, 2)), jnp.ones((6, 5)))
+    start = jnp.array([1.0, 9.0, 0.3])
+    truth, inputs = simulate.roll_out(draws, room(), none, start, scenario=scenario)
+    pose, poses = np.array(start, float), []
+    for _ in range(6):
+        pose = pose + 0.25 * np.array([np.cos(pose[2]), np.sin(pose[2]), 0.4])
+        poses.append(pose)
+    atol = tolerance(1e-12, 1e-5)
+    np.testing.assert_allclose(truth.pose, poses, rtol=0, atol=atol)
+    np.testing.assert_allclose(inputs.control, np.tile([1.0, 0.4], (6, 1)), rtol=1e-6)
+    np.testing.assert_array_equal(inputs.dt, np.full(6, 0.25))
+    to = np.asarray(room().landmarks, float) - np.array(poses)[:, None, :2]
+    distance = np.hypot(to[..., 0], to[..., 1])
+    valid = (distance < 3) & (np.arange(6) % 3 == 0)[:, None]
+    assert 1 < valid.sum() < 8
+    np.testing.assert_array_equal(inputs.valid, valid)
+    np.testing.assert_allclose(inputs.z[..., 0], np.where(valid, distance, 0), rtol=0, atol=atol)
+    exact = [ray_cast(jnp.array(p), scenario.beam_angles(), room().segments, 2.0) for p in poses]
+    np.testing.assert_allclose(inputs.ranges, exact, rtol=0, atol=tolerance(1e-9, 1e-4))
+
+
+def test_a_scan_s_noise_comes_after_the_cut_at_its_reach_and_ends_at_its_least_range():
+    """Nothing but one wall, 0.4 m ahead: beam by beam, what each draw makes of it."""
+    around = World(jnp.array([[(0.4, -0.05), (0.4, 0.05)]]), jnp.zeros((0, 2)))
+    draws = jnp.array([1.0, -1.0, -2.0, 0.5, -30.0])
+    got = simulate.look_round(draws, jnp.zeros(3), around, Noise(scan=0.1), scenario=OTHER)
+    np.testing.assert_allclose(got, [2.1, 1.9, 0.3, 2.05, 0.3], rtol=1e-6)  # the middle one: 0.4 - 0.2 is below 0.3
+
+
+def test_a_landmark_at_the_very_reach_is_not_seen():
+    for reach, near in ((3.0, False), (np.nextafter(np.float32(3), np.float32(0)), True)):
+        mark = jnp.array([float(reach), 0.0])
+        assert bool(simulate.sight(jnp.zeros(2), jnp.zeros(3), mark, Noise(), scenario=OTHER)[1]) is near
+
+
+@pytest.mark.parametrize(("drawn", "false"), [(0.29, True), (0.31, False)])
+def test_a_false_sighting_is_made_of_its_own_draws(drawn, false):
+    """Anywhere within the robot's own reach, and all around; what is drawn decides whether it is one."""
+    draws, noise = jnp.array([1.0, -1.0, drawn, 0.25, 0.875]), Noise(range=0.1, bearing=0.2, outlier_rate=0.3)
+    scenario = dataclasses.replace(OTHER, outliers=True)
+    z, near = simulate.sight(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), noise, scenario=scenario)
+    assert near
+    np.testing.assert_allclose(z, [0.75, 0.75 * np.pi] if false else [2.1, -0.2], rtol=1e-6)
+
+
+def test_what_a_step_s_draws_are_for(tolerance):
+    """The first turns the robot, the second and third are in what it measures alone."""
+    noise, pose, expected = Noise(heading=0.1, v=0.2, w=0.3), jnp.zeros(3), reference.course_control(0)
+    for i, (turn, control) in enumerate([(0.1, (0, 0)), (0, (0.2, 0)), (0, (0, 0.3))]):
+        moved, measured = simulate.drive(jnp.eye(3)[i], jnp.array(0), pose, noise, scenario=SHORT)
+        by = np.array([0.1 * expected[0], 0, 0.1 * expected[1] + turn])
+        np.testing.assert_allclose(moved, by, rtol=0, atol=tolerance(1e-15, 1e-7))
+        np.testing.assert_allclose(measured, expected + np.array(control), rtol=0, atol=tolerance(1e-15, 1e-7))
+
+
+@pytest.mark.parametrize(
+    ("off", "turned", "w"), [(0.0, 0.0, 0.0), (1.0, 0.0, 0.5), (-1.0, 0.0, -0.5), (0.0, 0.2, -0.2), (0.0, -0.2, 0.2)]
+)
+@pytest.mark.parametrize("place", [0.0, 2.0, -3.0])
+def test_the_loop_s_command_leads_back_to_its_circle(place, off, turned, w, tolerance):
+    """3 m around (6.0, 5.4), a lap in a minute; outside it turns in, and a heading that is off it turns back."""
+    pose = [6 + (3 + off) * np.cos(place), 5.4 + (3 + off) * np.sin(place), place + np.pi / 2 + turned]
+    got = LOOP.command(jnp.array(0), jnp.array(pose))
+    np.testing.assert_allclose(got, [np.pi / 10, np.pi / 30 + w], rtol=0, atol=tolerance(1e-14, 1e-5))
+
+
+def test_the_loop_is_two_laps_whose_true_start_is_drawn_from_the_prior():
+    assert LOOP.steps * LOOP.dt == 2 * 60
+    assert (LOOP.exact_prior, CAPSTONE.exact_prior) == (False, True)
+    np.testing.assert_allclose(LOOP.start, [9, 5.4, np.pi / 2])
+    assert simulate.SCENARIOS == {"capstone": CAPSTONE, "loop": LOOP}
+
+
+def test_the_robot_s_own_noise_as_a_filter_has_it():
+    """The heading noise of a step is what a yaw rate's of 0.02 / 0.5 would be: with 0.03 rad/s a 3-4-5 triangle."""
+    params = simulate.own_params(Noise(heading=0.02, v=0.1, w=0.03, range=0.2, bearing=0.3), 0.5)
+    np.testing.assert_allclose(params.Q, np.diag([0.01, 0.05**2]), rtol=1e-6)
+    np.testing.assert_allclose(params.R, np.diag([0.04, 0.09]), rtol=1e-6)
+
+
+def test_every_word_of_a_key_makes_another_drive():
+    for kind, words in (("threefry2x32", 2), ("rbg", 4)):
+        data = np.zeros((words + 1, words), np.uint32)
+        data[1:] = np.eye(words)
+        made = [tuple(map(int, normals.words_of(jax.random.wrap_key_data(row, impl=kind)))) for row in data]
+        assert len(set(made)) == words + 1
+        assert all(a != b for one, other in itertools.combinations(made, 2) for a, b in zip(one, other, strict=True))
 
 
 # --- Shapes ---
