@@ -687,19 +687,26 @@ def test_an_observation_whose_covariance_is_none_is_reported_and_not_called_used
     """R = -9 I makes that of the innovation negative."""
     correct = jax.jit(functools.partial(stages.correct, config=course.config(gate_softness=softness)))
     belief = Gaussian(jnp.array([1.0, 2.0, 0.0]), jnp.eye(3) * 1e-4)
-    rest = jnp.array([1.1, 0.01]), jnp.array([2.0, 2.0]), jnp.array(3, jnp.int32), jnp.array(True)
+    rest = jnp.array([1.01, 0.01]), jnp.array([2.0, 2.0]), jnp.array(3, jnp.int32), jnp.array(True)
     for R, fine in ((course.params.R, True), (-9 * jnp.eye(2), False)):
         after, sighting, used = correct(course.params._replace(R=R), belief, *rest)
         assert (bool(used), bool(sighting.accepted), int(sighting.row)) == (fine, fine, 3)
         assert bool(jnp.isfinite(sighting.nis)) is fine
         assert bool(jnp.all(after.cov == belief.cov)) is not fine
+    # Just outside the gate, where a hard one decides and a soft one weighs.
+    after, sighting, used = correct(course.params, belief, rest[0].at[0].set(1.48), *rest[1:])
+    assert (bool(used), bool(sighting.accepted), float(sighting.nis) > 9.21) == (True, False, True)
+    assert bool(jnp.all(after.mean == belief.mean)) is (softness == 0)
     _, sighting, used = correct(course.params, belief, *rest[:3], jnp.array(False))
     assert (bool(used), bool(sighting.accepted), int(sighting.row)) == (False, False, -1)
     assert not any(np.any(x) for x in sighting._replace(row=0))
 
 
 def test_what_is_collected_of_a_map_is_within_its_bounds(course):
-    """The loop leaves cells below the lower one until the end; who looks at a step sees what `step` would give."""
+    """The loop leaves cells below the lower one until the end; who looks at a step sees what `step` would give.
+
+    One beam ends 3 m ahead, one is longer than the reach of 4 m, and one is no longer than the least range.
+    """
     spec = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(3, 6), l_min=-0.5, l_max=0.6)
     steps, none = 4, np.zeros((4, 0))
     inputs = Inputs(
@@ -708,16 +715,16 @@ def test_what_is_collected_of_a_map_is_within_its_bounds(course):
         landmark=jnp.array(none, jnp.int32),
         z=jnp.zeros((steps, 0, 2)),
         valid=jnp.array(none, bool),
-        ranges=jnp.broadcast_to(jnp.array([3.0]), (steps, 1)),
+        ranges=jnp.broadcast_to(jnp.array([3.0, 5.0, 1.2]), (steps, 3)),
     )
-    config = Config(dt=0.1, grid=spec)
+    config, angles = Config(dt=0.1, grid=spec, min_range=1.2, max_range=4.0), jnp.array([0.0, 0.0, math.pi / 2])
     state = init(Gaussian(jnp.array([0.5, 1.5, 0.0]), jnp.eye(3) * 1e-4), config=config)
     _, maps = run(
-        course.params, state, inputs, beam_angles=jnp.zeros(1), config=config, collect=lambda state, *_: state.log_odds
+        course.params, state, inputs, beam_angles=angles, config=config, collect=lambda state, *_: state.log_odds
     )
     expected = np.zeros((steps, *spec.shape))
-    expected[:, 1, :3] = [[-0.4], [-0.5], [-0.5], [-0.5]]
-    expected[:, 1, 3] = 0.6
+    expected[:, 1, :3] = -0.5  # two beams cross them at every step
+    expected[:, 1, 3] = [0.45, 0.6, 0.6, 0.6]
     np.testing.assert_allclose(maps, expected, rtol=1e-6)
 
 
