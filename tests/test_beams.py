@@ -180,19 +180,37 @@ def test_a_very_long_beam_is_bresenhams(n):
     np.testing.assert_array_equal(last, np.where(first_outside > n, n, -1))
 
 
+@pytest.mark.parametrize(
+    ("reach", "shape", "exact"),
+    [
+        (1023, (9, 9), True),  # a beam of 1023 cells, and one spare for rounding
+        (1023.5, (9, 9), False),
+        (9000, (9, 9), False),
+        (50, (4096, 4096), True),
+        (50, (4096, 4097), False),  # 2**24 cells and more
+    ],
+)
+def test_float32_is_for_beams_of_1024_cells_on_maps_of_2_to_the_24(reach, shape, exact):
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=shape)
+    trace = functools.partial(beams.trace, spec=spec, min_range=0.0, max_range=reach * 0.5)
+    lines = jax.eval_shape(trace, jnp.zeros(3), jnp.zeros(2), jnp.zeros(2))
+    assert {lines.slope.dtype, lines.offset.dtype} == {jnp.dtype(jnp.float32 if exact else jnp.int32)}
+
+
 @pytest.mark.usefixtures("x64")
-def test_float32_is_not_asked_for_every_cell_of_a_beam_of_9000():
-    """It would misplace some of these; the reach is no longer than the beams, and float32 counts the map's cells."""
-    n, up = 9_000, np.arange(1, 1_790, 61)
-    spec = GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=(1_800, n + 2))
+def test_every_cell_of_a_beam_of_9000_cells_is_bresenhams():
+    """On a map as long, by as short a reach as will do: in float32 some would lie a cell beside."""
+    n, up = 9_000, np.array([1, 7, 1499, 2997, 3000, 4497, 4499, 4500])
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=(4_600, n + 2))
     ranges, angles = jnp.array(np.hypot(n, up) * 0.5), jnp.array(np.arctan2(up, n))
     j = np.arange(n + 1)
-    _, last, (column, row) = some_cells(
-        jnp.array([0.25, 0.25, 0.0]), ranges, angles, jnp.asarray(j[None], jnp.int32), spec=spec, max_range=4_600.0
+    pose = jnp.array([0.25, 0.25, 0.0])
+    free, last, (column, row) = some_cells(
+        pose, ranges, angles, jnp.asarray(j[None], jnp.int32), spec=spec, max_range=0.5 * 10_100
     )
-    np.testing.assert_array_equal(last, np.full(len(up), n))
-    np.testing.assert_array_equal(column, np.broadcast_to(j, column.shape))
+    np.testing.assert_array_equal(column, np.broadcast_to(j, (len(up), n + 1)))
     np.testing.assert_array_equal(row, (2 * j * up[:, None] + n - 1) // (2 * n))
+    np.testing.assert_array_equal([free, last], np.full((2, len(up)), n))
 
 
 def test_beams_of_more_cells_than_can_be_counted_are_refused():

@@ -86,6 +86,18 @@ def test_many_runs_are_cut_alike_for_any_number_of_devices_and_few_evenly():
         assert turns * 2 * chunk - runs < 2 * turns  # and the last one is as full as the others
 
 
+def test_few_runs_are_not_cut_into_whole_pages():
+    """At multiples of 512 runs arrays would lie whole pages apart."""
+    assert [chunks.even(3000, runs, 2) for runs in (1022, 1023, 1024, 1025, 2048)] == [511, 520, 520, 513, 1032]
+    assert chunks.even(512, 8 * 512, 1) == 520
+    assert chunks.even(512, 9 * 512, 1) == 512  # of many turns the chunk depends on nothing else
+
+
+def test_a_processor_s_cache_memory_and_runs_are_bounded_and_an_accelerator_s_are_larger():
+    assert chunks.CPU == (8 * 2**20, 2 * 2**30 // 8, 3000)
+    assert all(a < b for a, b in zip(chunks.CPU, chunks.ACCELERATOR, strict=True))
+
+
 def choose(monkeypatch, need, runs=10**9, run=Silent(1)):
     """The chunk for programs that `need` so many bytes for a chunk, and the chunks that were compiled."""
     tried = []

@@ -91,6 +91,21 @@ def test_more_than_the_limit_is_refused_and_the_limit_can_be_raised(tmp_path, mo
             logs.read_trajectory(path)
 
 
+def test_a_file_of_just_the_limit_is_read_which_is_128_mib_unless_said(tmp_path, monkeypatch):
+    monkeypatch.delenv("JAXLOCMAP_MAX_BYTES", raising=False)
+    assert files.most_bytes() == 128 * 2**20
+    path, text = tmp_path / "a", b"x" * 100
+    path.write_bytes(text)
+    for limit, fine in ((100, True), (99, False)):
+        monkeypatch.setenv("JAXLOCMAP_MAX_BYTES", str(limit))
+        for read in (lambda: files.read(path), lambda: files.unzipped(path, gzip.compress(text))):
+            if fine:
+                assert read() == text
+            else:
+                with pytest.raises(ValueError, match=f"a: expected .* of at most {limit} bytes, got more"):
+                    read()
+
+
 def packed(element):
     """A MATLAB file of one compressed element."""
     content = zlib.compress(element)

@@ -471,6 +471,16 @@ def test_calibration_is_numpys(tolerance):
     np.testing.assert_allclose(bins.error, np.nansum(np.abs(mean - share) * counts) / len(p), rtol=rtol)
 
 
+def test_a_probability_on_an_edge_falls_into_the_bin_above():
+    """A half, exactly; and a cell that is not to be scored falls into none."""
+    where = jnp.array([[True, True, True, False]])
+    sums = grid.score(jnp.zeros((1, 4)), jnp.array([[True, False, True, True]]), where, bins=4)
+    np.testing.assert_array_equal(sums.cells, [0, 0, 3, 0])
+    np.testing.assert_array_equal(sums.probability, [0, 0, 1.5, 0])
+    np.testing.assert_array_equal(sums.occupied, [0, 0, 2, 0])
+    assert (float(sums.square), float(sums.entropy_bits)) == (0.75, 4.0)
+
+
 def test_certain_cells_fall_into_the_last_bins():
     log_odds = jnp.array([[50.0, -50.0]])
     bins = calibration(log_odds, jnp.array([[True, False]]), jnp.ones((1, 2), bool), bins=4)

@@ -11,7 +11,7 @@ import pytest
 from programs import free_port
 
 from jaxlocmap import hosts
-from jaxlocmap.monte_carlo import monte_carlo
+from jaxlocmap.monte_carlo import _exchange, monte_carlo
 from jaxlocmap.parts import Parts
 
 
@@ -175,3 +175,53 @@ def test_who_does_not_come_in_time_is_told(monkeypatch):
         with pytest.raises(TimeoutError, match=f"^processes: expected 2 to meet at {re.escape(where)} within 0.01 s"):
             hosts.join(where, 2, 1, timeout=0.01)
     late.set()
+
+
+# --- A study shared, and the devices here ---
+
+
+@pytest.mark.parametrize("process", [0, 1])
+def test_the_parts_of_all_processes_come_in_order(monkeypatch, process):
+    """Of three parts the first process has two and the other one, which sends nothing at the second turn."""
+    parts = [np.array([float(part), -part]) for part in range(3)]
+    turns = iter([parts[:2], [parts[2], np.zeros(2)]])
+    said = played(monkeypatch, lambda _: next(turns), process=process)
+    outputs = (jax.ShapeDtypeStruct((), float), jax.ShapeDtypeStruct((1,), float))
+    every = list(_exchange([(part,) for part in parts[process::2]], 3, outputs))
+    np.testing.assert_array_equal(every, [(part,) for part in parts])
+    np.testing.assert_array_equal(said, [parts[process], parts[2] if process == 0 else np.zeros(2)])
+
+
+def test_runs_of_several_processes_are_not_kept(monkeypatch):
+    played(monkeypatch, lambda value: [value, value])
+    with pytest.raises(ValueError, match=r"^keep_runs: expected one process, got 2$"):
+        monte_carlo(lambda key: jnp.zeros(()), jax.random.key(0), 3, keep_runs=True)
+
+
+@pytest.mark.parametrize(("count", "asked"), [(None, 16), (3, 3), (16, 16)])
+def test_as_many_devices_are_asked_for_as_there_are_cores_or_fewer(monkeypatch, count, asked):
+    settings = {}
+    monkeypatch.setattr(hosts, "cores", lambda: 16)
+    monkeypatch.setattr(jax.config, "update", settings.__setitem__)
+    monkeypatch.setattr(jax, "local_devices", lambda: ["cpu"] * settings["jax_num_cpu_devices"])
+    assert hosts.use_all_cores(count) == asked
+    assert settings == {"jax_num_cpu_devices": asked}
+
+
+@pytest.mark.parametrize(
+    ("value", "least", "most", "refused"),
+    [
+        (1, 1, None, None),
+        (0, 1, None, "least 1, a whole number, got 0"),
+        (0, 0, None, None),
+        (5, 1, 5, None),
+        (6, 1, 5, "most 5, got 6"),
+        (True, 0, 5, "least 0, a whole number, got True"),
+    ],
+)
+def test_a_count_is_a_whole_number_between_its_bounds(value, least, most, refused):
+    if refused is None:
+        hosts.check_count("runs", value, least, most)
+    else:
+        with pytest.raises(ValueError, match=f"^runs: expected at {refused}$"):
+            hosts.check_count("runs", value, least, most)

@@ -244,6 +244,28 @@ def test_pixels_that_look_like_white_space_are_pixels(tmp_path):
     np.testing.assert_array_equal(loaded.cells, np.full((2, 3), OCCUPIED))
 
 
+def test_a_picture_of_a_million_pixels_a_row_is_read_row_by_row(tmp_path):
+    """And one of many narrow rows in blocks, the last of which is smaller."""
+    rng = np.random.default_rng(0)
+    for rows, columns in ((3, 600_000), (5001, 501)):
+        grey = rng.integers(0, 256, (rows, columns), dtype=np.uint8)
+        picture = f"P5\n{columns} {rows}\n255\n".encode() + grey.tobytes()
+        cells = load_map(written(tmp_path, picture=picture)).cells
+        p = (255 - grey[::-1]) / 255
+        np.testing.assert_array_equal(cells, np.where(p > 0.65, OCCUPIED, np.where(p < 0.196, FREE, UNKNOWN)))
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+@pytest.mark.parametrize("negate", [False, True])
+def test_a_pixel_on_the_very_threshold_is_between(tmp_path, mode, negate):
+    """Of p = 0.8 and 0.2; between the thresholds scale goes from 0 to 99."""
+    sheet = SHEET.replace("0.65", "0.8").replace("0.196", "0.2").replace("negate: 0", f"negate: {int(negate)}")
+    pixels = np.array([[50, 51, 52, 203, 204, 205]])
+    cells = painted(tmp_path, 255 - pixels if negate else pixels, mode, sheet)
+    between = [99, 98, 0, 0] if mode == "scale" else [UNKNOWN] * 4
+    np.testing.assert_array_equal(cells, [[OCCUPIED, *between, FREE]])
+
+
 # --- Damage ---
 
 

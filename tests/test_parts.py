@@ -356,6 +356,26 @@ def test_every_difference_shows_in_the_manifest():
     json.dumps(made())
 
 
+def test_the_user_s_flags_and_what_is_wanted_are_in_the_manifest(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    plain = made()
+    assert plain["xla_flags"] == ""
+    monkeypatch.setenv("XLA_FLAGS", "--xla_mine=1")
+    assert made()["xla_flags"] == "--xla_mine=1"
+    assert differing(plain, made()) == {"xla_flags"}
+    assert (plain["runs"], plain["chunk"], plain["precision"]) == (10, 4, str(jnp.zeros(()).dtype))
+    one, other = (manifest(Split(1, 1), "", jax.random.key(0), pair) for pair in (((1.0, 2.0)), (2.0, 1.0)))
+    assert differing(one, other) == {"arguments"}
+    assert manifest(Split(1, 1), "", jax.random.key(0), (), keep_runs=True)["keep_runs"] is True
+
+
+def test_a_study_of_sums_does_not_go_on_as_one_of_runs(folder):
+    stopped(20, chunk=4, parts=at(folder))
+    told = r"^resume: expected the study .* got another: .*keep_runs was False, is True"
+    with pytest.raises(ValueError, match=told):
+        monte_carlo(walk, KEY, 30, 2.0, parts=at(folder, resume=True), keep_runs=True)
+
+
 @pytest.mark.slow
 def test_the_manifest_is_the_same_in_another_process():
     code = f"""if 1:

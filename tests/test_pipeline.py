@@ -635,6 +635,99 @@ def test_a_step_length_that_is_none_is_flagged(bad, short, config):
     assert float(info.belief.cov[4, 2, 2]) > float(info.belief.cov[3, 2, 2])
 
 
+def test_what_is_not_said_of_a_step_is_taken_for_its_own_reason(course):
+    """Standing still for the time that passed, or moving not at all for a nominal time; told, either way."""
+    belief = Gaussian(jnp.array([1.0, 2.0, 0.5]), jnp.eye(3) * 1e-4)
+    go, config = jnp.array([0.7, 0.3]), course.config()
+    predict = jax.jit(functools.partial(stages.predict, config=config))
+    for control, dt, taken, usable in (
+        (go, 0.0, (go, 0.0), True),
+        (go, 0.4, (go, 0.4), True),
+        (go.at[0].set(jnp.nan), 0.4, (0 * go, 0.4), False),
+        (go.at[1].set(jnp.inf), 0.4, (0 * go, 0.4), False),
+        (go, jnp.nan, (0 * go, config.dt), False),
+        (go, -0.4, (0 * go, config.dt), False),
+        (go, jnp.inf, (0 * go, config.dt), False),
+    ):
+        got, was_usable = predict(course.params, belief, control, jnp.array(dt))
+        arguments = *belief, taken[0], jnp.array(taken[1]), course.params.Q
+        expected = ekf.predict(*arguments, motion=motion.ARC, nominal_dt=config.dt)
+        chex.assert_trees_all_close(tuple(got), expected, rtol=1e-6, atol=1e-9)
+        assert bool(was_usable) is usable
+
+
+@pytest.mark.parametrize(
+    ("place", "bad"), [(place, bad) for place in range(3) for bad in (math.nan, math.inf, -math.inf)]
+)
+def test_a_belief_is_sound_if_all_of_it_is(place, bad):
+    mean, cov = jnp.array([1.0, 2.0, 0.5]), jnp.eye(3)
+    assert stages.sound(Gaussian(mean, cov))
+    assert not stages.sound(Gaussian(mean.at[place].set(bad), cov))
+    assert not stages.sound(Gaussian(mean, cov.at[place, place].set(bad)))
+    assert not stages.sound(Gaussian(mean, cov.at[place, place].set(-1.0)))
+
+
+def test_a_place_is_held_below_16384_m_in_float32_on_either_side_of_either_axis():
+    far, near = 16_384, 16_384 - 2**-10
+    places = [[near, 0], [far, 0], [-near, 0], [-far, 0], [0, far], [0, -far], [near, -near]]
+    x, y = jnp.array(places, jnp.float32).T
+    np.testing.assert_array_equal(stages.is_held(x, y), [True, False, True, False, False, False, True])
+    assert not stages.is_held(jnp.array(jnp.nan), jnp.array(0.0))
+
+
+def test_a_range_is_one_above_zero_and_a_bearing_any_number():
+    reach = jnp.array([1e-9, 0.0, -0.0, -1.0, jnp.nan, jnp.inf, 1.0, 1.0, 1.0, 1.0])
+    bearing = jnp.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.0, jnp.nan, jnp.inf, -jnp.inf])
+    expected = [True, False, False, False, False, False, True, False, False, False]
+    np.testing.assert_array_equal(stages.is_measurement(reach, bearing), expected)
+
+
+@pytest.mark.parametrize("softness", [0.0, 1.0])
+def test_an_observation_whose_covariance_is_none_is_reported_and_not_called_used(softness, course):
+    """R = -9 I makes that of the innovation negative."""
+    correct = jax.jit(functools.partial(stages.correct, config=course.config(gate_softness=softness)))
+    belief = Gaussian(jnp.array([1.0, 2.0, 0.0]), jnp.eye(3) * 1e-4)
+    rest = jnp.array([1.01, 0.01]), jnp.array([2.0, 2.0]), jnp.array(3, jnp.int32), jnp.array(True)
+    for R, fine in ((course.params.R, True), (-9 * jnp.eye(2), False)):
+        after, sighting, used = correct(course.params._replace(R=R), belief, *rest)
+        assert (bool(used), bool(sighting.accepted), int(sighting.row)) == (fine, fine, 3)
+        assert bool(jnp.isfinite(sighting.nis)) is fine
+        assert bool(jnp.all(after.cov == belief.cov)) is not fine
+    # Just outside the gate, where a hard one decides and a soft one weighs.
+    after, sighting, used = correct(course.params, belief, rest[0].at[0].set(1.48), *rest[1:])
+    assert (bool(used), bool(sighting.accepted), float(sighting.nis) > 9.21) == (True, False, True)
+    assert bool(jnp.all(after.mean == belief.mean)) is (softness == 0)
+    _, sighting, used = correct(course.params, belief, *rest[:3], jnp.array(False))
+    assert (bool(used), bool(sighting.accepted), int(sighting.row)) == (False, False, -1)
+    assert not any(np.any(x) for x in sighting._replace(row=0))
+
+
+def test_what_is_collected_of_a_map_is_within_its_bounds(course):
+    """The loop leaves cells below the lower one until the end; who looks at a step sees what `step` would give.
+
+    One beam ends 3 m ahead, one is longer than the reach of 4 m, and one is no longer than the least range.
+    """
+    spec = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(3, 6), l_min=-0.5, l_max=0.6)
+    steps, none = 4, np.zeros((4, 0))
+    inputs = Inputs(
+        dt=jnp.full(steps, 0.1),
+        control=jnp.zeros((steps, 2)),
+        landmark=jnp.array(none, jnp.int32),
+        z=jnp.zeros((steps, 0, 2)),
+        valid=jnp.array(none, bool),
+        ranges=jnp.broadcast_to(jnp.array([3.0, 5.0, 1.2]), (steps, 3)),
+    )
+    config, angles = Config(dt=0.1, grid=spec, min_range=1.2, max_range=4.0), jnp.array([0.0, 0.0, math.pi / 2])
+    state = init(Gaussian(jnp.array([0.5, 1.5, 0.0]), jnp.eye(3) * 1e-4), config=config)
+    _, maps = run(
+        course.params, state, inputs, beam_angles=angles, config=config, collect=lambda state, *_: state.log_odds
+    )
+    expected = np.zeros((steps, *spec.shape))
+    expected[:, 1, :3] = -0.5  # two beams cross them at every step
+    expected[:, 1, 3] = [0.45, 0.6, 0.6, 0.6]
+    np.testing.assert_allclose(maps, expected, rtol=1e-6)
+
+
 def test_a_step_of_no_length_changes_nothing(short, config):
     _, info = localise(edit(short, dt=short.inputs.dt.at[4].set(0.0)), config)
     assert bool(jnp.all(info.ok))

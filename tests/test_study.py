@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import math
 import re
 
@@ -18,7 +19,7 @@ from jaxlocmap.consistency import COVERAGE_LEVELS
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.scoring import NEES_EDGES, PHASES, Averages, Undiverged
 from jaxlocmap.simulate import CAPSTONE, LOOP, Noise
-from jaxlocmap.study import MapTotals, Study, Totals, median_nees, summarise
+from jaxlocmap.study import MapTotals, Study, Totals, median_nees, pose_means, reference_study, summarise
 
 # What the plant really does, seen by a first-order filter: the heading noise of a step is a yaw rate's as well.
 PLANT = {"v": 0.02, "w": math.hypot(0.01, 0.005 / 0.1), "range": 0.08, "bearing": 0.02}
@@ -800,6 +801,106 @@ def test_a_report_of_totals_made_by_hand():
         "calibration_probability": pytest.approx([0.1, 0.0, 0.9]),
         "calibration_frequency": pytest.approx([1 / 6, 0.0, 0.5]),
     }
+
+
+def test_every_mean_over_runs_is_of_its_own_runs_with_their_spread():
+    """Five runs, of which the last diverged and the one before has a step without a score."""
+    rng = np.random.default_rng(0)
+
+    def drawn(expected, *shape):
+        return expected + 0.01 * rng.normal(size=(5, *shape))
+
+    levels = np.array(COVERAGE_LEVELS)
+    average = Averages(drawn(3), drawn(0.9545, 3), drawn(levels, len(levels)))
+    kept = Undiverged(drawn(3), drawn(1, 3), drawn(3, PHASES))
+    kept = jax.tree.map(lambda x: np.where((np.arange(5) < 4).reshape(-1, *[1] * (x.ndim - 1)), x, 0), kept)
+    kept.phase_nees[3] = 0
+    nis = drawn(2)
+
+    def added(runs):
+        return jax.tree.map(lambda x: np.sum(x, axis=0), runs), jax.tree.map(lambda x: np.sum(x**2, axis=0), runs)
+
+    totals = hand_made()._replace(
+        **dict(zip(("average", "average_square"), added(average), strict=True)),
+        **dict(zip(("undiverged", "undiverged_square"), added(kept), strict=True)),
+        **{name: np.array(float(n)) for name, n in {"runs": 5, "scored_runs": 5, "observing_runs": 3}.items()},
+        **{name: np.array(float(n)) for name, n in {"undiverged_runs": 4, "whole_runs": 3}.items()},
+        run_nis=np.array([nis[:3].sum(), (nis[:3] ** 2).sum()]),
+    )
+    means = pose_means(totals, SHORT_CONFIG)
+    expected = [
+        (means.nees, average.nees, 3),
+        (means.undiverged_nees, kept.nees[:4], 3),
+        *zip(means.axis_nees, kept.axis_nees[:4].T, [1] * 3, strict=True),
+        *zip(means.within_two_sigma, average.within_two_sigma.T, [scipy.stats.chi2.cdf(4, 1)] * 3, strict=True),
+        *zip(means.covered, average.covered.T, levels, strict=True),
+        *zip(means.phases, kept.phase_nees[:3].T, [3] * PHASES, strict=True),
+    ]
+    report = summarise(totals, SHORT_CONFIG)
+    for mean, values, centre in expected:
+        error, reach = standard_error(values), scipy.stats.t.ppf(0.975, len(values) - 1)
+        assert mean.value == pytest.approx(values.mean(), rel=1e-12)
+        assert mean.standard_error == pytest.approx(error, rel=1e-6)
+        assert mean.band_95 == pytest.approx((centre - reach * error, centre + reach * error), rel=1e-6)
+        assert mean.interval_95 == pytest.approx((mean.value - reach * error, mean.value + reach * error), rel=1e-6)
+    error, reach = standard_error(nis[:3]), scipy.stats.t.ppf(0.975, 2)
+    assert report["nis_standard_error"] == pytest.approx(error, rel=1e-6)
+    assert report["nis_band_95"] == pytest.approx((2 - reach * error, 2 + reach * error), rel=1e-6)
+    assert report["anees_undiverged_interval_95"] == means.undiverged_nees.interval_95
+
+
+def test_however_far_apart_shares_lie_their_band_is_that_of_independent_ones():
+    """Of two runs of which one has every step inside an ellipsoid and one none: no more than p (1 - p) / 2."""
+    half = hand_made().average._replace(covered=np.ones(4))
+    totals = hand_made()._replace(average=half, average_square=half)
+    reach = scipy.stats.t.ppf(0.975, 1)
+    for mean, level in zip(pose_means(totals, SHORT_CONFIG).covered, COVERAGE_LEVELS, strict=True):
+        most = reach * min(0.5, math.sqrt(level * (1 - level) / 2))
+        assert mean.band_95 == pytest.approx((level - most, level + most), rel=1e-12)
+
+
+@pytest.mark.parametrize(("steps", "edges"), [(8, [0, 2, 4, 6, 8]), (10, [0, 3, 5, 8, 10]), (4, [0, 1, 2, 3, 4])])
+def test_the_phases_of_a_report_are_from_step_to_step_in_seconds(steps, edges):
+    """Step k ends k + 1 periods after the start; a phase is from the end of its first step to that of its last."""
+    totals = hand_made()._replace(nees=np.zeros(steps))
+    spans = pose_means(totals, dataclasses.replace(SHORT_CONFIG, dt=0.5)).phase_spans
+    np.testing.assert_allclose(spans, [(0.5 * (a + 1), 0.5 * b) for a, b in itertools.pairwise(edges)])
+    np.testing.assert_array_equal(
+        np.searchsorted(edges, np.arange(steps), "right") - 1, PHASES * np.arange(steps) // steps
+    )
+
+
+@pytest.mark.parametrize(("before", "inside", "share"), [(0, 1, 0.5), (1, 4, 0.375), (3, 3, 0.0), (0, 10, 0.5)])
+def test_the_median_lies_in_its_bin_where_half_of_the_runs_are_below(before, inside, share):
+    """So many runs in the bins before it, so many in it; on the logarithmic scale of its edges."""
+    bins, i = np.zeros(len(NEES_EDGES) + 1), 60
+    bins[i], bins[i - 5] = inside, before
+    if before == inside:  # then the lower bin holds the median, up to its upper edge
+        i, share = i - 5, 1.0
+    expected = NEES_EDGES[i - 1] ** (1 - share) * NEES_EDGES[i] ** share
+    assert median_nees(bins) == pytest.approx(expected, rel=1e-12)
+    assert median_nees(np.eye(len(bins))[0]) == NEES_EDGES[0]
+
+
+def test_the_bins_of_the_median_are_5_per_cent_apart_from_a_tenth_to_ten_thousand():
+    assert NEES_EDGES[0] == pytest.approx(0.1)
+    assert 1e4 / 1.06 < NEES_EDGES[-1] < 1e4
+    np.testing.assert_allclose(np.diff(np.log(NEES_EDGES)), 0.05, rtol=1e-9)
+
+
+def test_a_filter_that_is_told_the_truth_differs_in_nothing_else():
+    config = dataclasses.replace(SHORT.config(motion="capstone", gate_probability=0.9), sensor_offset=(0.1, 0.2, 0.3))
+    noise = Noise(heading=0.01, v=0.03, w=0.02, range=0.1, bearing=0.05)
+    study, params = reference_study(SHORT, config, noise)
+    assert study == Study(SHORT, dataclasses.replace(config, motion="euler", grid=None))
+    jax.tree.map(np.testing.assert_array_equal, params, simulate.own_params(noise, SHORT.dt))
+
+
+def test_what_such_a_filter_shows_is_in_the_report():
+    totals = hand_made()
+    sharper = totals._replace(average=totals.average._replace(nees=np.array(5.0)))
+    assert summarise(totals, SHORT_CONFIG, sharper)["anees_reference"] == 2.5
+    assert summarise(totals, SHORT_CONFIG, sharper)["anees"] == 3.0
 
 
 def test_runs_without_a_score_are_no_part_of_the_average():

@@ -279,3 +279,33 @@ def test_what_a_type_can_hold_passes_and_what_is_no_number_is_no_matter_of_preci
 
 def test_what_is_traced_is_not_looked_at():
     jax.eval_shape(lambda x: checks.resolved("here", x, jnp.float32), jnp.array(1e6))
+
+
+# --- numbers that a user is told
+
+
+def test_settings_that_are_not_given_are_those_written_beside_them():
+    assert Config() == Config(
+        dt=0.1,
+        motion="arc",
+        gate_probability=0.99,
+        gate_softness=0.0,
+        sensor_offset=(0.0, 0.0, 0.0),
+        grid=None,
+        min_range=0.05,
+        max_range=8.0,
+    )
+    assert GridSpec(**GRID) == GridSpec(**GRID, l_min=-4.0, l_max=4.0)
+    params = Params.from_std(**STD)
+    np.testing.assert_allclose([params.l_occ, params.l_free], [0.85, -0.40], rtol=1e-7)
+
+
+@pytest.mark.parametrize("definite", [False, True])
+def test_a_covariance_is_symmetric_to_five_digits(definite):
+    for off, fine in ((5e-6, True), (5e-5, False)):
+        P = np.array([[1.0, 0.5], [0.5 * (1 + off), 1.0]])
+        if fine:
+            checks.covariance("P", P, 2, definite=definite)
+        else:
+            with pytest.raises(ValueError, match=r"^P: expected a symmetric matrix, got"):
+                checks.covariance("P", P, 2, definite=definite)
