@@ -168,6 +168,15 @@ def test_small_arrays_travel_entry_by_entry_and_others_whole(monkeypatch):
     assert set(travelling.pop()) == {(), (0, 3), (4, 5)}
 
 
+@pytest.mark.parametrize(("shape", "small"), [((9,), True), ((3, 3), True), ((10,), False), ((2, 5), False)])
+def test_arrays_of_up_to_nine_entries_are_small(shape, small):
+    """As the covariance of a pose is."""
+    x = np.arange(np.prod(shape)).reshape(shape)
+    parts, together = batching.apart([jnp.array(x)])
+    assert [part.shape for part in parts] == ([()] * x.size if small else [shape])
+    np.testing.assert_array_equal(together(parts)[0], x)
+
+
 def test_a_branch_on_what_all_share_stays_one_in_a_batch():
     """And one on what differs does not: it would run both sides."""
 

@@ -7,7 +7,7 @@ import pytest
 from test_logs import data, flaser, refused, write  # noqa: F401
 
 from jaxlocmap import logs
-from jaxlocmap.logs.fan import Fan, directions
+from jaxlocmap.logs.fan import Fan, directions, fits
 from jaxlocmap.logs.text import numbers, table, whole
 
 
@@ -93,6 +93,14 @@ def test_directions_are_the_fans_own():
     np.testing.assert_array_equal(directions(Fan(4, spacing=0.5)), [-0.75, -0.25, 0.25, 0.75])
 
 
+@pytest.mark.parametrize(("share", "fit"), [(1.09, True), (1.11, False), (0.91, True), (0.89, False)])
+def test_a_spacing_may_be_off_by_a_tenth(share, fit):
+    fan = Fan(1001, fov=2.0, spacing=2e-3 / share)
+    assert fits(fan) == fit
+    if fit:
+        np.testing.assert_allclose(directions(fan)[[0, -1]], [-1, 1], rtol=0, atol=2e-3)
+
+
 # --- what a range means
 
 
@@ -151,6 +159,12 @@ def test_rawlaser_gets_its_pose_from_odometry(read):
     assert read(rawlaser([1.0] * 3, 1.0).replace("0.017453", "1.570796")).truth.shape == (0, 3)
 
 
+def test_scans_whose_stamps_go_back_are_counted(read):
+    log = read("".join(robotlaser([1.0] * 541, stamp=stamp) for stamp in (1.0, 2.0, 3.0, 2.5, 4.0)))
+    assert log.counts["backward_stamps"] == 1
+    assert log.scan_time.tolist() == [1, 2, 3, 2.5, 4]
+
+
 def test_rawlaser_beside_scans_with_poses_is_a_copy(read):
     log = read(rawlaser([1.0] * 541, 1.0) + robotlaser([2.0] * 541))
     np.testing.assert_array_equal(log.scan, np.full((1, 541), 2.0))
@@ -207,6 +221,14 @@ def test_only_decimal_numbers_of_ascii_are_numbers(tmp_path, field):
     refused(lambda: table(path, ("time", "v")), f"{path}:1: v: expected a finite number, got")
     refused(lambda: numbers([field], ("v",), "here"), "here: v: expected a finite number, got")
     refused(lambda: whole("n", field, "here", least=0), "here: n: expected a whole number >= 0, got")
+
+
+@pytest.mark.parametrize(("field", "taken"), [("1e12", True), ("-1e12", True), ("1.01e12", False), ("-1.01e12", False)])
+def test_numbers_are_taken_up_to_a_million_millions(field, taken):
+    if taken:
+        assert numbers([field], ["x"], "a:1") == [float(field)]
+    else:
+        refused(lambda: numbers([field], ["x"], "a:1"), "a:1: x: expected a number of a size up to 1e+12")
 
 
 def test_whole_numbers():

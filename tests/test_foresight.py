@@ -25,11 +25,11 @@ def drive(steps=9):
 
 
 def in_plain_loops(l_occ, l_free, counted):
-    """Log-loss and number of cells. How often beams cross and end in each cell comes from maps of ones."""
+    """Log-loss, number of cells, and the bins. How often beams cross and end in each cell comes from maps of ones."""
     sizes = {"origin": SPEC.origin, "resolution": SPEC.resolution, **LIMITS}
     free_range = {"l_min": -1e9, "l_max": 1e9}
     none = np.zeros(SPEC.shape)
-    log_odds, loss, cells = none.copy(), 0.0, 0.0
+    log_odds, loss, cells, bins = none.copy(), 0.0, 0.0, np.zeros((3, 10))
     for pose, ranges, counts in zip(*drive(), counted, strict=True):
         crossed = reference.update_scan(none, pose, ranges, ANGLES, l_occ=0.0, l_free=1.0, **sizes, **free_range)
         ended = reference.update_scan(none, pose, ranges, ANGLES, l_occ=1.0, l_free=0.0, **sizes, **free_range)
@@ -37,9 +37,12 @@ def in_plain_loops(l_occ, l_free, counted):
         if counts:
             loss -= float(np.sum(crossed * np.log(1 - p)) + np.sum(ended * np.log(p)))
             cells += float(crossed.sum() + ended.sum())
+            row = np.floor(p * 10).astype(int).ravel()
+            for b, amount in zip(bins, (crossed + ended, (crossed + ended) * p, ended), strict=True):
+                b += np.bincount(row, amount.ravel(), 10)
         bounds = {"l_min": SPEC.l_min, "l_max": SPEC.l_max}
         log_odds = reference.update_scan(log_odds, pose, ranges, ANGLES, l_occ=l_occ, l_free=l_free, **sizes, **bounds)
-    return loss, cells
+    return loss, cells, bins
 
 
 def foreseen(l_occ, l_free, counted, **kwargs):
@@ -52,8 +55,9 @@ def foreseen(l_occ, l_free, counted, **kwargs):
 @pytest.mark.parametrize("counted", [np.ones(9, bool), np.arange(9) >= 5])
 def test_it_is_what_plain_loops_give(counted, tolerance):
     got = foreseen(L_OCC, L_FREE, counted)
-    loss, cells = in_plain_loops(L_OCC, L_FREE, counted)
+    loss, cells, _ = in_plain_loops(L_OCC, L_FREE, counted)
     assert float(got.cells) == cells > 50
+    assert not np.any(got[2:])
     assert float(got.log_loss) == pytest.approx(loss, rel=tolerance(1e-12, 1e-5))
 
 
@@ -64,15 +68,28 @@ def test_a_map_that_knows_nothing_pays_log_two_a_cell(tolerance):
     assert float(loss) == pytest.approx(float(cells) * np.log(2), rel=tolerance(1e-13, 1e-6))
 
 
-def test_bins_hold_every_cell_once(tolerance):
-    plain, got = (foreseen(L_OCC, L_FREE, np.ones(9, bool), bins=bins) for bins in (False, True))
-    assert float(got.log_loss) == float(plain.log_loss)
-    assert float(got.bin_cells.sum()) == float(got.cells)
-    assert 0 < float(got.bin_hits.sum()) < float(got.cells)
-    some = np.asarray(got.bin_cells) > 0
-    means = np.asarray(got.bin_probability)[some] / np.asarray(got.bin_cells)[some]
-    edges = np.flatnonzero(some) / BINS
-    assert np.all((means >= edges - 1e-6) & (means <= edges + 1 / BINS + 1e-6))
+@pytest.mark.parametrize("counted", [np.ones(9, bool), np.arange(9) % 3 > 0])
+def test_bins_are_those_of_plain_loops(counted, tolerance):
+    """Over the scans that count, in tenths of probability; what was never seen lies at 0.5, in the sixth."""
+    got = foreseen(L_OCC, L_FREE, counted, bins=True)
+    loss, cells, bins = in_plain_loops(L_OCC, L_FREE, counted)
+    assert BINS == 10
+    assert float(got.cells) == cells == bins[0].sum()
+    assert float(got.log_loss) == pytest.approx(loss, rel=tolerance(1e-12, 1e-5))
+    assert np.count_nonzero(bins[0]) > 4
+    for found, expected in zip((got.bin_cells, got.bin_probability, got.bin_hits), bins, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=tolerance(1e-12, 1e-4), atol=1e-6)
+
+
+@pytest.mark.parametrize(("beyond", "bound"), [(99.0, 2.5), (-99.0, -3.0)])
+def test_what_lies_beyond_the_bounds_counts_as_at_them(beyond, bound):
+    poses, ranges = drive()
+    args = tuple(map(jnp.asarray, (poses[0], ranges[0], ANGLES)))
+    losses = [
+        jax.jit(lambda *a: scan_log_loss(*a, spec=SPEC, **LIMITS))(jnp.full(SPEC.shape, x), *args)
+        for x in (beyond, bound)
+    ]
+    assert losses[0] == losses[1]
 
 
 def test_derivatives_are_those_of_the_loops(x64):

@@ -99,6 +99,34 @@ def test_the_report_of_many_runs_is_numpy_s():
     assert report["rmse_position_m"] == pytest.approx(np.sqrt((error[..., :2] ** 2).sum(-1).mean()), rel=1e-9)
     assert report["rmse_yaw_rad"] == pytest.approx(np.sqrt((error[..., 2] ** 2).mean()), rel=1e-9)
     np.testing.assert_allclose(report["rmse_per_step"], np.sqrt((error**2).mean(0)), rtol=1e-9)
+    variance = np.diagonal(made.cov, axis1=-2, axis2=-1)
+    np.testing.assert_allclose(report["sigma_per_step"], np.sqrt(variance.mean(0)), rtol=1e-9)
+    assert report["nees_median"] == pytest.approx(np.median(nees), rel=1e-9)
+    assert report["anees_median_run"] == pytest.approx(np.median(averages), rel=1e-9)
+    assert report["anees_standard_error"] == pytest.approx(scipy.stats.sem(averages), rel=1e-9)
+    assert report["independent_samples"] == RUNS
+    step_band = np.array(scipy.stats.chi2.interval(0.95, 3 * RUNS)) / RUNS
+    assert report["nees_band_95"] == pytest.approx(step_band, rel=1e-9)
+    in_band = (nees.mean(0) >= step_band[0]) & (nees.mean(0) <= step_band[1])
+    assert report["nees_steps_in_band"] == in_band.mean()
+    for k, phase in enumerate(report["nees_phases"]):
+        part = nees[:, 24 * k : 24 * (k + 1)].mean(1)
+        assert phase["anees"] == pytest.approx(part.mean(), rel=1e-9)
+        band = scipy.stats.t.interval(0.95, RUNS - 1, loc=3, scale=scipy.stats.sem(part))
+        assert phase["band_95"] == pytest.approx(band, rel=1e-9)
+        assert (phase["from_s"], phase["to_s"]) == pytest.approx((2.4 * k, 2.4 * k + 2.3))
+    assert len(report["nees_phases"]) == 10
+    for axis, shares in zip(report["within_two_sigma_interval_95"].values(), (ratio <= 4).mean(1).T, strict=True):
+        interval = scipy.stats.t.interval(0.95, RUNS - 1, loc=shares.mean(), scale=scipy.stats.sem(shares))
+        assert axis == pytest.approx(interval, rel=1e-9)
+    run_nis = np.nanmean(nis.reshape(RUNS, -1), axis=1)
+    assert report["nis_standard_error"] == pytest.approx(scipy.stats.sem(run_nis), rel=1e-9)
+    band = scipy.stats.t.interval(0.95, RUNS - 1, loc=2, scale=scipy.stats.sem(run_nis))
+    assert report["nis_band_95"] == pytest.approx(band, rel=1e-9)
+    of_step = np.array(scipy.stats.chi2.interval(0.95, 2 * 3 * RUNS)) / (3 * RUNS)
+    assert report["nis_chi2_band_95"][0] == pytest.approx(of_step, rel=1e-9)
+    assert report["nis_chi2_band_95"][1] is None
+    assert (report["nis_degrees"], report["unscored_observations"]) == (2, 0)
     assert report["nis_mean"] == pytest.approx(np.nanmean(nis.reshape(RUNS, -1), axis=1).mean(), rel=1e-9)
     assert report["nis_per_step"][0] == pytest.approx(np.nanmean(nis[:, 0]), rel=1e-9)
     assert report["nis_per_step"][1] is None
@@ -258,6 +286,126 @@ def test_runs_that_lost_the_robot_are_counted_and_the_others_judged():
     assert report["verdict"].startswith("not consistent: ANEES")
     assert report["verdict"].endswith("; 1 of 50 runs diverged")
     assert report["anees_median_run"] < 3.5 < report["anees"]
+    # Axes and phases are the others'.
+    others = judge(*(np.delete(x, 7, axis=0) for x in (truth, made.mean, made.cov)))
+    assert report["axis_nees"] == pytest.approx(others["axis_nees"], rel=1e-9)
+    for one, other in zip(report["nees_phases"], others["nees_phases"], strict=True):
+        assert one["anees"] == pytest.approx(other["anees"], rel=1e-9)
+    assert f"ANEES {others['anees']:.4g} of the others" in report["verdict"]
+
+
+def test_a_run_is_lost_that_ends_without_a_belief_or_was_lost_on_the_way():
+    """At its last step whose truth is known; one run alone, or all together, are judged as they are."""
+    made = drives()
+    truth, cov, valid = made.truth.copy(), made.cov.copy(), np.ones((RUNS, STEPS), bool)
+    truth[2, 50] += [5.0, 0.0, 0.0]  # found again
+    cov[3, -1] = np.nan
+    cov[4, 199], valid[4, 200:] = -np.eye(3), False
+    cov[5, 100] = np.nan  # in the midst of it
+    valid[6] = False  # of this run nothing is known
+    cov[7, 200], valid[7, 200:] = np.nan, False
+    report = judge(truth, made.mean, cov, valid=valid)
+    assert report["diverged_runs"] == 3
+    assert "; 3 of 49 runs diverged" in report["verdict"]
+    alone = judge(truth[2], made.mean[2], cov[2])
+    assert "diverged" not in alone["verdict"]
+    assert alone["nees_phases"][2]["anees"] > 10
+
+
+def test_entries_may_differ_from_their_mirror_images_by_a_millionth_of_what_they_could_be():
+    made = drives(2, 12)
+    for entries, share, count in (((0, 1), 0.99e-6, 0), ((0, 1), 1.01e-6, 1), ((2, 0), 1.01e-6, 1)):
+        cov = made.cov.copy()
+        i, j = entries
+        cov[1, 3, i, j] = cov[1, 3, j, i] + share * math.sqrt(cov[1, 3, i, i] * cov[1, 3, j, j])
+        assert judge(made.truth, made.mean, cov)["counts"]["not_symmetric"] == count
+
+
+def test_two_sigma_is_counted_to_its_edge_and_the_ellipsoids_without_theirs():
+    """Errors along one axis, of 2 and a little more deviations, 4 of them, and steps enough for no more."""
+    mean, cov = np.zeros((1, 4, 3)), np.tile(np.eye(3), (1, 4, 1, 1))
+    truth = np.zeros((1, 4, 3))
+    truth[0, :, 0], truth[0, :, 1], truth[0, :2, 2] = [2.0, -2.0, 2.000001, 0.0], [0, 0, 3, -3], 0.5
+    report = judge(truth, mean, cov)
+    assert report["within_two_sigma"] == {"x": 0.75, "y": 0.5, "yaw": 1.0}
+
+
+def test_a_phase_of_one_run_has_the_run_s_correlation_time():
+    made = drives(1, 3000, seed=3)
+    report = judge(*made[:3])
+    nees = numpy_nees(made)[0]
+    samples = report["independent_samples"] / 10
+    reach = scipy.stats.t.ppf(0.975, samples - 1) * math.sqrt(6 / samples)
+    for k, phase in enumerate(report["nees_phases"]):
+        assert phase["anees"] == pytest.approx(nees[300 * k : 300 * (k + 1)].mean(), rel=1e-9)
+        assert phase["band_95"] == pytest.approx((3 - reach, 3 + reach), rel=1e-9)
+
+
+@pytest.mark.parametrize(("times", "found"), [(0.98, 0), (1.02, 1)])
+def test_a_phase_is_dishonest_beyond_a_band_widened_for_ten_of_them(times, found):
+    """Runs whose NEES has mean 3 but for one phase, and whose averages have a spread known beforehand."""
+    runs, steps = 40, 20
+    spread = np.where(np.arange(runs) % 2, 0.5, -0.5)
+    nees = np.full((runs, steps), 3.0) + spread[:, None]
+    reach = scipy.stats.t.ppf(1 - 0.05 / 10 / 2, runs - 1) * 0.5 / math.sqrt(runs - 1)
+    nees[:, 6:8] += times * reach
+    truth = np.zeros((runs, steps, 3))
+    truth[..., 0] = np.sqrt(nees)
+    report = judge(truth, np.zeros_like(truth), np.tile(np.eye(3), (runs, steps, 1, 1)), time=0.5 * np.arange(steps))
+    assert len(report["dishonest"]) == found
+    if found:
+        assert (report["dishonest"][0]["from_s"], report["dishonest"][0]["to_s"]) == (3.0, 3.5)
+        assert report["dishonest"][0]["anees"] == pytest.approx(3 + times * reach, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [{"S": -np.eye(2)}, {"S": np.array([[1.0, 2.0], [2.0, 1.0]])}, {"S": np.zeros((2, 2))}, {"nu": np.nan},
+     {"S": np.full((2, 2), np.inf)}, {"S": np.diag([0.0, 1.0])}],
+)  # fmt: skip
+def test_what_has_no_covariance_is_observed_and_not_scored(spoilt):
+    made = drives(2, 12)
+    nu, S = made.nu.copy(), made.S.copy()
+    nu[1, 3, 0], S[1, 3, 0] = spoilt.get("nu", nu[1, 3, 0]), spoilt.get("S", S[1, 3, 0])
+    observed = np.isfinite(made.nu[..., 0])
+    report = judge(*made[:3], innovations=Innovations(nu, S, observed))
+    assert (report["observations"], report["unscored_observations"]) == (24, 1)
+    left = numpy_nis(made)
+    left[1, 3, 0] = np.nan
+    assert report["nis_mean"] == pytest.approx(np.nanmean(left.reshape(2, -1), axis=1).mean(), rel=1e-9)
+    assert report["nis_per_step"][3] == pytest.approx(np.nansum(left[:, 3]) / 5, rel=1e-9)
+
+
+def test_what_is_not_observed_counts_nowhere():
+    made = drives(2, 12)
+    observed, accepted = np.isfinite(made.nu[..., 0]), np.ones((2, 12, 3), bool)
+    observed[0, :6], accepted[0, :6], accepted[1, 0] = False, False, False
+    report = judge(*made[:3], innovations=Innovations(made.nu, made.S, observed, accepted), gate_probability=0.99)
+    assert (report["observations"], report["longest_rejection"]) == (18, 3)
+    assert report["gate_accept_rate"] == pytest.approx(15 / 18)
+    assert report["gate_nominal_rate"] == 0.99
+    nis = numpy_nis(made)
+    assert report["nis_per_step"][0] == pytest.approx(nis[1, 0].mean(), rel=1e-9)
+    assert report["nis_mean"] == pytest.approx((nis[0, 6:][::3].mean() + np.nanmean(nis[1])) / 2, rel=1e-9)
+    for name in ("observed", "accepted"):
+        given = Innovations(made.nu, made.S)
+        with pytest.raises(ValueError, match=f"{name}: expected shape"):
+            judge(*made[:3], innovations=given._replace(**{name: accepted[:, :5]}))
+        with pytest.raises((ValueError, TypeError), match=f"^{name}"):
+            judge(*made[:3], innovations=given._replace(**{name: accepted.astype(int)}))
+    with pytest.raises(ValueError, match="landmark: expected shape"):
+        judge(*made[:3], innovations=Innovations(made.nu, made.S, landmark=np.zeros((2, 5), int)))
+
+
+@pytest.mark.parametrize(
+    ("refused", "longest"), [("1110111", 3), ("0111110", 5), ("1111", 4), ("0000", 0), ("1001101", 2)]
+)
+def test_the_longest_streak_is_counted_from_end_to_end(refused, longest):
+    steps = len(refused)
+    accepted = np.array([c == "0" for c in refused])
+    pose = np.zeros((steps, 3)), np.zeros((steps, 3)), np.tile(np.eye(3), (steps, 1, 1))
+    given = Innovations(np.ones((steps, 1)), np.ones((steps, 1, 1)), accepted=accepted)
+    assert judge(*pose, innovations=given)["longest_rejection"] == longest
 
 
 def test_the_gate_is_judged_by_its_share_and_its_longest_streak():
@@ -307,6 +455,12 @@ def test_a_step_that_is_missing_in_every_run_may_share_its_stamp_with_the_next()
     for time, seen in (([0, 1, 1, 2], ~valid), ([0, 1, 0.5, 2], valid), ([0, 1, math.nan, 2], valid)):
         with pytest.raises(ValueError, match="time: expected increasing stamps, got"):
             judge(*arrays, time=time, valid=seen)
+
+
+def test_innovations_of_zero_are_not_correlated():
+    pose = np.zeros((4, 3)), np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))
+    report = judge(*pose, innovations=Innovations(np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1))))
+    assert report["innovation_lag_one"] == {"range": 0, "bearing": 0}
 
 
 # --- Files ---
@@ -591,6 +745,53 @@ def test_what_is_shown_of_a_judgement(monkeypatch, capsys):
     assert shown == [("title", head + left), ("title", [*head, ("i", "", ""), *left])]
     said = "over-confident from 1.25 to 2.5 s (x 0.5 to 1.5 m, y -2 to 3 m): NEES 9.5"
     assert said in " ".join(capsys.readouterr().out.split())
+
+
+def test_innovations_lie_in_slots_of_the_last_stamp_not_after_them(tmp_path):
+    names = ("time", "nu1", "nu0", "S11", "S01", "S00", "accepted", "landmark")
+    rows = [(2.0, 1, 2, 3, 4, 5, 0, 7), (0.0, 11, 12, 13, 14, 15, 1, 3), (1.99, 21, 22, 23, 24, 25, 1, 5),
+            (9.0, 31, 32, 33, 34, 35, 1, 6)]  # fmt: skip
+    got = read_innovations(csv(tmp_path / "nu.csv", names, rows), np.array([0.0, 1.0, 2.0]))
+    at = [(2, 0), (0, 0), (1, 0), (2, 1)]
+    assert got["innovation"].shape == (3, 2, 2)
+    assert got["observed"].sum() == 4
+    for (step, slot), row in zip(at, rows, strict=True):
+        np.testing.assert_array_equal(got["innovation"][step, slot], [row[2], row[1]])
+        np.testing.assert_array_equal(got["S"][step, slot], [[row[5], row[4]], [row[4], row[3]]])
+        assert (got["observed"][step, slot], got["accepted"][step, slot]) == (True, row[6] == 1)
+        assert got["landmark"][step, slot] == row[7]
+    empty = ~got["observed"]
+    assert np.isnan(got["innovation"][empty]).all()
+    assert np.isnan(got["S"][empty]).all()
+    assert not got["accepted"][empty].any()
+    assert (got["landmark"][empty] == -1).all()
+
+
+def test_a_heading_is_that_of_its_quaternion_whatever_its_length_and_tilt(tmp_path):
+    """Yaw, then pitch, then roll; and the same three times as long."""
+    yaw, pitch, roll = 2.0, 0.4, -0.3
+    cy, sy, cp, sp, cr, sr = (f(a / 2) for a in (yaw, pitch, roll) for f in (math.cos, math.sin))
+    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+    y, z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    path = tmp_path / "a.tum"
+    path.write_text(f"0 1 2 3 {x} {y} {z} {w}\n1 1 2 3 {3 * x} {3 * y} {3 * z} {3 * w}\n2 1 2 3 {-x} {-y} {-z} {-w}\n")
+    np.testing.assert_allclose(read_trajectory(path).pose, [[1, 2, yaw]] * 3, rtol=1e-12)
+
+
+def test_runs_beside_each_other_count_from_their_first_stamp(tmp_path):
+    """The time is that of the longest; the counts are those of all files."""
+    truth = csv(tmp_path / "truth.csv", COLUMNS[:4], [(100, 0, 0, 0), (103, 3, 0, 0), (101, 1, 0, 0), (101, 1, 0, 0)])
+    rows = [(t, 0, 0, 0, 1, 0, 0, 1, 0, 1) for t in (100.5, 101.0, 102.0, 103.0)]
+    short = csv(tmp_path / "short.csv", COLUMNS, rows[1:3])
+    long = csv(tmp_path / "long.csv", COLUMNS, rows)
+    read = [read_trajectory(path) for path in (truth, short, long)]
+    both = pair([read[0]] * 2, read[1:], ["short", "long"], max_gap=0.0)
+    np.testing.assert_array_equal(both.time, [0, 0.5, 1.5, 2.5])
+    np.testing.assert_array_equal(both.valid, [[True, False, False, False], [False, True, False, True]])
+    np.testing.assert_array_equal(both.stamps[0], [101, 102])
+    assert np.isnan(both.cov[0, 2:]).all()
+    assert both.counts == {"backward_stamps": 2, "duplicate_stamps": 2, "without_truth": 3}
+    assert pair([read[0]], read[1:2], ["short"], max_gap=2.0).valid.all()
 
 
 # --- The figure ---

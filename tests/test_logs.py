@@ -109,6 +109,16 @@ def test_mrclam(tmp_path, packed):
     assert log.stated_variance is None
 
 
+def test_mrclam_counts_each_kind_of_sighting_it_drops(tmp_path):
+    """Of robots, misread, of a landmark without a place, without a range: one, two, three and four."""
+    barcodes, ranges = [5, 77, 78, 99, 99, 99, 63, 63, 81, 81, 81], [1] * 6 + [0, -1, 0, -2, 3]
+    rows = "".join(f"1248444187.3 {code} {reach} 0.5\n" for code, reach in zip(barcodes, ranges, strict=True))
+    log = logs.read_mrclam(mrclam(tmp_path / "data", Robot1_Measurement=rows), 1)
+    kinds = ("other_robots", "unknown_barcodes", "unmapped_landmarks", "bad_sightings")
+    assert [log.counts[kind] for kind in kinds] == [1, 2, 3, 4]
+    np.testing.assert_array_equal(log.sighting, [[3, 0.5]])
+
+
 def test_mrclam_without_truth(tmp_path):
     log = logs.read(mrclam(tmp_path, without=["Robot1_Groundtruth.dat"]), "mrclam", 1)
     assert log.truth.shape == (0, 3)
@@ -445,6 +455,18 @@ def test_read_dispatch(tmp_path):
                 "sighting": np.ones((1, 2)),
             },
             "sighting_landmark: expected rows from -1 to -1, got 0 to 0",
+        ),
+        (
+            {
+                "sighting_time": np.zeros(1),
+                "sighting_landmark": np.full(1, -2, np.int32),
+                "sighting": np.ones((1, 2)),
+            },
+            "sighting_landmark: expected rows from -1 to -1, got -2 to -2",
+        ),
+        (
+            {"truth_time": np.array([-1.1e12]), "truth": np.zeros((1, 3))},
+            "truth_time: expected numbers of a size up",
         ),
     ],
 )

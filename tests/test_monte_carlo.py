@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -132,6 +133,13 @@ def test_anything_but_a_whole_number_from_one_on_is_refused(name, wrong):
         ValueError, match=f"^{name}: expected at least 1, a whole number, got {re.escape(repr(wrong))}$"
     ):
         monte_carlo(one_run, KEY, numbers["runs"], *ARGS, chunk=numbers["chunk"])
+
+
+def test_a_chunk_is_no_larger_than_the_study_and_time_is_told():
+    began = time.perf_counter()
+    result = monte_carlo(one_run, KEY, 5, *ARGS, chunk=100)
+    assert 0 < result.run_s < time.perf_counter() - began
+    assert (result.chunk, result.processes, result.resumed_runs) == (5, 1, 0)
 
 
 def test_whole_numbers_may_be_numpy_s():

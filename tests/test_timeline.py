@@ -195,6 +195,27 @@ def test_a_log_that_starts_in_a_crowd_starts_at_its_truth(programs):
     np.testing.assert_array_equal(programs.first_pose(crowd([1]), timeline), np.zeros(3))
 
 
+def test_what_lies_before_is_told_from_what_lies_after_and_a_stamp_at_the_limit_is_neither():
+    seen, scans = [-2.0, -1.0, 0.5, 1.0, 1.25, 1.4], [-3.0, 0.25, 0.75, 1.25, 1.3]
+    log = log_of(DRIVE[:3], sightings=seen, scans=scans)
+    timeline = logs.to_timeline(log, start=0.5, stop=1.25)
+    np.testing.assert_array_equal(timeline.time, [0.5, 0.75, 1, 1.25])
+    np.testing.assert_array_equal(timeline.inputs.valid[:, 0], [1, 0, 1, 1])
+    np.testing.assert_array_equal(np.isfinite(timeline.inputs.ranges[:, 0]), [0, 1, 0, 1])
+    names = ("before_odometry", "before_start", "after_stop")
+    assert [timeline.counts[name] for name in names] == [3, 1, 2]
+    # Before the first command there is no step, whatever the start.
+    early = logs.to_timeline(log, start=-5.0)
+    assert early.time[0] == 0
+    assert [early.counts[name] for name in names] == [3, 0, 0]
+
+
+def test_stamps_that_go_back_count_in_every_stream():
+    log = log_of([DRIVE[0], DRIVE[2], DRIVE[1]], sightings=[1, 0.5, 0.25], scans=[4, 3, 2, 1], truth=[1, 0, 1, 0, 1, 0])
+    counts = logs.to_timeline(log, max_gap=9.0).counts
+    assert (counts["backward_stamps"], counts["backward_truth"]) == (1 + 2 + 3, 3)
+
+
 # --- Small logs on disk ---
 
 

@@ -88,6 +88,55 @@ def test_a_curvature_below_one_ten_thousandth_is_none(share, flat):
     assert ("w: the loss does not depend on it here" in found.words) == flat
 
 
+@pytest.mark.parametrize(("own", "said"), [(0.99, False), (1.01, True)])
+def test_a_coordinate_is_vague_from_a_standard_error_of_one(own, said):
+    found = judged_alone(own)
+    assert any("known to no more than a factor" in words for words in found.words) == said
+
+
+@pytest.mark.parametrize(("errors", "said"), [(0.99, False), (1.01, True), (-1.01, True)])
+def test_a_minimum_is_missed_by_more_than_a_standard_error(errors, said):
+    found = judged_alone(0.1, gradient=0.1 * errors)
+    assert any("not yet at its minimum, some 1 standard errors away" in words for words in found.words) == said
+
+
+def judged_alone(own, gradient=0.0):
+    """One parameter of 20 sequences whose coordinate has this standard error."""
+    influence = np.array([[1.0], [-1.0]] * 10) * own * np.sqrt(19) / 20
+    return _judge(("v",), np.ones(1), np.array([gradient]), np.eye(1), influence, np.eye(1))
+
+
+@pytest.mark.parametrize(("n", "few"), [(19, True), (20, False)])
+def test_fewer_than_20_sequences_are_few(n, few):
+    influence = np.random.default_rng(0).normal(size=(n, 1)) * 0.01
+    words = _judge(("v",), np.ones(1), np.zeros(1), np.eye(1), influence, np.eye(1)).words
+    assert words == ((f"{n} sequences are few: standard errors are known to some 17 %, and come out too small",) * few)
+
+
+@pytest.mark.parametrize(("part", "named"), [(0.098, False), (0.102, True)])
+def test_who_has_a_tenth_of_a_direction_without_curvature_has_a_part_in_it(part, named):
+    axis = np.array([np.sqrt(1 - part**2), part])
+    influence = np.random.default_rng(0).normal(size=(30, 2)) * 0.01
+    for sign, together in ((1, "v, w can change together"), (-1, "v can change together against w")):
+        along = axis * [1, sign]
+        hessian = np.eye(2) - np.outer(along, along)
+        found = _judge(("v", "w"), np.ones(2), np.zeros(2), hessian, influence, np.eye(2))
+        said = f"{together}: the loss stays the same" if named else "v: the loss does not depend on it here"
+        assert found.words == (said,)
+        np.testing.assert_array_equal(np.isinf(found.standard_error), [True, named])
+
+
+def test_what_is_lost_is_tied_to_nothing_and_a_correlation_ends_at_one():
+    """Of two parameters alike in their errors the one the loss does not depend on is not called tied."""
+    influence = np.outer([1.0, -1.0] * 15, [1.0, 1.0]) * 0.03
+    scale = np.array([[1.0, 0.0], [1.0, 0.0]])
+    found = _judge(("v_w", "w"), np.array([0.9, 1.0]), np.zeros(2), np.diag([1.0, 0.0]), influence, scale)
+    assert found.correlation[0, 1] == pytest.approx(1)
+    assert found.words == ("w: the loss does not depend on it here",)
+    reach = scipy.stats.t.ppf(0.975, 29) * 0.03 * np.sqrt(30 / 29) * np.sqrt(30)
+    assert found.interval_95[0].tolist() == [pytest.approx(max(0.9 - reach, -1)), 1]
+
+
 @pytest.mark.parametrize("n", [2, 8, 30])
 def test_errors_and_intervals_are_those_written_out(n):
     """In units of the parameters, with Student's t, along the logarithm of what has one."""

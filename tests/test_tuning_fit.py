@@ -12,7 +12,7 @@ import scipy.optimize
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives
 from jax.flatten_util import ravel_pytree
 
-from jaxlocmap import simulate, tuning
+from jaxlocmap import Gaussian, Params, simulate, tuning
 
 OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation", 1.0),))
 START = simulate.course_params()
@@ -92,6 +92,124 @@ def test_scipy_takes_the_same_gradient(x64):
     assert np.all(np.abs(found.jac) < 1e-3)
     with pytest.raises(ValueError, match="tuned: expected some of"):
         tuning.coordinates_objective(OBJECTIVE, START, ("speed",))
+
+
+class Bowl:
+    """In place of an objective: Σ (log range)² · weight over the sequences, whose weights are in the prior's mean. What
+    is judged may be told beforehand.
+    """
+
+    def __init__(self, told=()):
+        self.told, self.asked = list(told), []
+
+    def check_tuned(self, tuned):
+        pass
+
+    def check(self, params, batch):
+        pass
+
+    def __call__(self, params, batch):
+        return jnp.sum(batch.prior.mean[:, 0]) * (0.5 * jnp.log(params.R[0, 0])) ** 2, {}
+
+    def judged(self, params, batch):
+        self.asked.append(batch)
+        return (self.told.pop(0) if self.told else float(self(params, batch)[0])), {}
+
+
+def weights(*values):
+    values = jnp.asarray(values, float)
+    mean = jnp.stack([values, 0 * values, 0 * values], axis=1)
+    return tuning.Batch(Gaussian(mean, jnp.zeros((len(values), 3, 3))), None, jnp.ones((len(values), 1), bool))
+
+
+def bowl(told=(), batch=None, **options):
+    params = Params.from_std(v=1.0, w=1.0, range=2.0, bearing=1.0)
+    objective = Bowl(told)
+    options = {"tuned": ("range",), "optimiser": optax.sgd(0.1)} | options
+    batch = weights(1.0, 2.0) if batch is None else batch
+    return tuning.fit(objective, params, batch, **options), objective
+
+
+FALLING = tuple(-float(i) for i in range(30))
+
+
+@pytest.mark.parametrize(
+    ("told", "options", "epochs", "best"),
+    [
+        (FALLING, {}, 20, 20),  # of two steps each, as said
+        (FALLING, {"epochs": 3}, 3, 3),
+        ((1.0, 0.0, 0.0, 0.0), {}, 3, 1),  # two without progress are the end
+        ((1.0, 0.0, 0.5, 0.5, 0.5), {"patience": 3}, 4, 1),
+        ((1.0, 0.0, 0.5, -1.0, 0.5, 0.5), {}, 5, 3),  # progress in between starts anew
+        # Progress is a ten-thousandth of what the loss has fallen since the start, though less of it is kept.
+        ((1.0, 0.0, -0.9e-4, -1.8e-4, -9.0), {}, 3, 3),
+        ((1.0, 0.0, -1.1e-4, -2.2e-4, -2.2e-4, -2.2e-4), {}, 5, 3),
+        ((101.0, 1.0, 0.9901, 0.9802, -9.0), {}, 3, 3),
+        ((101.0, 1.0, 0.9899, 0.9798, 9.0, 9.0), {}, 5, 3),
+        ((1.0, 0.0, -0.09, -0.18, -9.0), {"tolerance": 0.1}, 3, 3),
+        ((1.0, 0.0, -0.11, -0.23, 9.0, 9.0), {"tolerance": 0.1}, 5, 3),
+        ((1.0, 2.0, 3.0, -1.0), {}, 2, 0),  # the start, if nothing is better
+    ],
+)
+def test_it_goes_on_while_the_loss_falls_by_its_tolerance(told, options, epochs, best):
+    found, _ = bowl(told, **options)
+    assert found.losses.tolist() == list(told[: epochs + 1])
+    assert (found.best_epoch, found.loss) == (best, told[best])
+    assert len(found.trace.loss) == 2 * epochs
+    assert found.stopped_early == (told[:4] != FALLING[:4])
+    # And what is kept is what that epoch had come to.
+    way = [2.0, *np.asarray(found.trace.params["range"])[2::2]]
+    if best < epochs:
+        assert float(tuning.natural(found.params)["range"]) == pytest.approx(way[best], rel=1e-6)
+
+
+def test_the_trace_is_of_before_each_step():
+    """Of 3 x² with x = log range: slope 6 x, and a tenth of that a step."""
+    found, _ = bowl(epochs=2, steps=3)
+    x = math.log(2) * 0.4 ** np.arange(7)
+    np.testing.assert_allclose(found.trace.loss, 3 * x[:6] ** 2, rtol=1e-5)
+    np.testing.assert_allclose(found.trace.gradient_norm, 6 * x[:6], rtol=1e-5)
+    np.testing.assert_allclose(found.trace.params["range"], np.exp(x[:6]), rtol=1e-5)
+    np.testing.assert_array_equal(found.trace.evaluations, 1)
+    np.testing.assert_allclose(found.losses, 3 * x[[0, 3, 6]] ** 2, rtol=1e-5)
+    assert float(tuning.natural(found.params)["range"]) == pytest.approx(math.exp(x[6]), rel=1e-5)
+
+
+def test_the_validation_set_picks_the_best():
+    batch, other = weights(1.0, 2.0), weights(5.0)
+    found, objective = bowl(batch=batch, validation=other, epochs=2)
+    assert all(asked is other for asked in objective.asked)
+    np.testing.assert_allclose(found.losses[0], 5 * math.log(2) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(found.trace.loss[0], 3 * math.log(2) ** 2, rtol=1e-5)
+    assert all(asked is batch for asked in bowl(batch=batch, epochs=1)[1].asked)
+
+
+def test_a_minibatch_is_drawn_anew_without_repetition_and_moves_by_5_percent():
+    """A loss names the sequences it is of: their weights are powers of two."""
+    batch = weights(*2.0 ** np.arange(6))
+    options = {"batch": batch, "minibatch": 3, "epochs": 4, "steps": 5, "told": FALLING, "tolerance": 0.0}
+    found, again, other = (bowl(key=jax.random.key(k), optimiser=None, **options)[0] for k in (0, 0, 1))
+    x = np.log(np.asarray(found.trace.params["range"], float))
+    drawn = np.asarray(found.trace.loss) / x**2
+    np.testing.assert_allclose(drawn, np.round(drawn), rtol=1e-3)
+    picked = (np.round(drawn).astype(int)[:, None] >> np.arange(6)) & 1
+    np.testing.assert_array_equal(picked.sum(1), 3)
+    assert np.all(picked.any(0))
+    assert len(np.unique(drawn[:5].round())) > 1  # within an epoch,
+    assert not np.array_equal(drawn[:5].round(), drawn[5:10].round())  # and from one to the next
+    np.testing.assert_array_equal(found.trace.loss, again.trace.loss)
+    assert not np.array_equal(found.trace.loss, other.trace.loss)
+    assert x[1] - x[0] == pytest.approx(-0.05, rel=1e-4)  # Adam's first step is its rate
+
+
+def test_the_limits_of_tuning_are_refused_beyond_a_thousandth():
+    for deviation, inside in ((1.0005e5, True), (1.002e5, False), (0.9995e-5, True), (0.998e-5, False)):
+        params = Params.from_std(v=1.0, w=deviation, range=1.0, bearing=1.0)
+        if inside:
+            tuning.coordinates_objective(Bowl(), params, ("v",))
+        else:
+            with pytest.raises(ValueError, match="w: expected a value within the limits of tuning"):
+                tuning.coordinates_objective(Bowl(), params, ("v",))
 
 
 @pytest.mark.parametrize("name", ["epochs", "steps", "patience"])

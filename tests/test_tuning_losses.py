@@ -12,18 +12,22 @@ import scipy.stats
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives
 
 from jaxlocmap import Params, simulate, tuning
+from jaxlocmap.foresight import Foresight
 from jaxlocmap.tuning import losses
-from jaxlocmap.tuning.filtering import filtered
+from jaxlocmap.tuning.filtering import check_batch, filtered
 from jaxlocmap.tuning.losses import LOSSES
 
 OTHER = Params.from_std(v=0.05, w=0.1, range=0.12, bearing=0.01, l_free=-0.43)  # ten times -0.4 is just l_min
 
 
-@pytest.fixture(scope="module")
-def reported():
-    """What the filter reports of the batch, as NumPy arrays."""
-    batch = drives()
-    info = jax.jit(lambda batch: filtered(OTHER, batch, config=ONLY_POSES, collect=lambda info, _: info))(batch)
+@jax.jit
+def _reported(params, batch):
+    return filtered(params, batch, config=ONLY_POSES, collect=lambda info, _: info)
+
+
+def reported(params, batch):
+    """What the filter reports of a batch, as NumPy arrays, and the truth."""
+    info = _reported(params, batch)
     return jax.tree.map(lambda x: np.asarray(x, np.float64), info), np.asarray(batch.truth, np.float64)
 
 
@@ -54,24 +58,45 @@ def from_chi(squared, degrees):
     return (d.mean() - chi.mean()) ** 2 + (d.std() - chi.std()) ** 2
 
 
-def by_hand(info, truth):
-    seen = info.row >= 0
+def by_hand(info, truth, counted, known):
+    """Over observations of steps that count, and over steps that count and whose truth is known."""
+    seen = (info.row >= 0) & counted[..., None]
+    judged = counted & known
     e = errors(info, truth)
     density = np.exp(info.log_likelihood[seen])
     nees = nees_of(info, truth)
+    log_det = np.linalg.slogdet(info.belief.cov)[1]
     return {
         "innovation": -np.log(0.99 * density + 0.01 / (2 * np.pi * ONLY_POSES.max_range)).mean(),
-        "pose": 0.5 * (nees + np.linalg.slogdet(info.belief.cov)[1] + 3 * np.log(2 * np.pi)).mean(),
-        "state": (e**2).sum(-1).mean(),
-        "nees": from_chi(nees, 3),
+        "pose": 0.5 * (nees + log_det + 3 * np.log(2 * np.pi))[judged].mean(),
+        "state": (e**2).sum(-1)[judged].mean(),
+        "nees": from_chi(nees[judged], 3),
         "nis": from_chi(info.nis[seen], 2),
     }
 
 
-def test_losses_are_their_formulas(reported, tolerance):
-    expected = by_hand(*reported)
+def some_of(batch):
+    """Every step but a few that do not count, a few whose truth is unknown, and slots that hold nothing."""
+    steps = np.arange(12)
+    counted, known = np.array(batch.counted), np.array(batch.known)
+    counted[0, 8:], counted[1, ::3], known[2, :5], known[1, 1] = False, False, False, False
+    valid = np.array(batch.inputs.valid)
+    valid[3, :, 1], valid[0, steps > 5, 2] = False, False
+    inputs = batch.inputs._replace(valid=jnp.asarray(valid))
+    return batch._replace(counted=jnp.asarray(counted), known=jnp.asarray(known), inputs=inputs)
+
+
+@pytest.mark.parametrize(
+    ("params", "change"),
+    [(OTHER, lambda batch: batch), (OTHER, some_of), (OWN._replace(Q=OWN.Q / 400, R=OWN.R / 100), some_of)],
+    ids=["all that is there", "what is counted and known", "beyond the far quantile"],
+)
+def test_losses_are_their_formulas(params, change, tolerance):
+    batch = change(drives())
+    info, truth = reported(params, batch)
+    expected = by_hand(info, truth, np.asarray(batch.counted), np.asarray(batch.known))
     weights = tuple((name, 0.5 + i) for i, name in enumerate(expected))
-    total, got = judged(tuning.Objective(ONLY_POSES, weights), OTHER, drives())
+    total, got = judged(tuning.Objective(ONLY_POSES, weights), params, batch)
     assert float(total) == pytest.approx(sum(w * float(got[n]) for n, w in weights), rel=tolerance(1e-12, 1e-5))
     for name, value in expected.items():
         assert float(got[name]) == pytest.approx(value, rel=tolerance(1e-10, 1e-3), abs=tolerance(0, 1e-5)), name
@@ -164,7 +189,86 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     assert missed[2.0] < 1e-3 < 0.1 < missed[0.0]
 
 
+def test_the_map_is_told_the_configuration_and_the_batch(monkeypatch):
+    """Each sequence with its own poses, ranges and count, and the limits of the laser by their names."""
+    told = []
+
+    def foresee(l_occ, l_free, poses, ranges, counted, beam_angles, **limits):
+        told.append((limits, beam_angles))
+        total = l_occ + 2 * l_free + jnp.sum(poses) + jnp.sum(ranges) + jnp.sum(jnp.where(counted, 1.0, 0.0))
+        return Foresight(total, jnp.sum(jnp.where(counted, 1.0, 0.0)), *[jnp.zeros(3)] * 3)
+
+    monkeypatch.setattr(losses, "foresee", foresee)
+    batch = some_of(drives())
+    config = dataclasses.replace(CONFIG, min_range=0.3, max_range=7.0)
+    got = losses.foreseen(jnp.array(0.5), jnp.array(-0.25), batch, batch.truth, config=config, bins=True)
+    counted = np.asarray(batch.counted).sum(1)
+    rest = np.asarray(batch.truth).sum((1, 2)) + np.asarray(batch.inputs.ranges).sum((1, 2))
+    np.testing.assert_allclose(got.log_loss, counted + rest, rtol=1e-4)
+    np.testing.assert_array_equal(got.cells, counted)
+    assert told[0][0] == {"spec": CONFIG.grid, "min_range": 0.3, "max_range": 7.0, "bins": True}
+    np.testing.assert_array_equal(told[0][1], batch.beam_angles)
+    for missing in (
+        {"config": ONLY_POSES},
+        {"batch": batch._replace(beam_angles=None)},
+        {"batch": batch._replace(inputs=batch.inputs._replace(ranges=None))},
+    ):
+        args = {"batch": batch, "config": CONFIG} | missing
+        with pytest.raises(ValueError, match=r"loss `map`: expected config\.grid, batch\.inputs\.ranges and"):
+            losses.foreseen(jnp.array(0.5), jnp.array(-0.25), args["batch"], batch.truth, config=args["config"])
+
+
+def test_a_map_has_no_slope_by_the_poses(monkeypatch):
+    def filtered(params, batch, **_):
+        return {}, jnp.ones((4, 12)), jnp.broadcast_to(params.R[0, 0], (4, 12, 3))
+
+    def foreseen(l_occ, l_free, batch, poses, **_):
+        each = l_occ * jnp.sum(poses, axis=(1, 2))
+        return Foresight(each, jnp.ones(4), *[jnp.zeros(3)] * 3)
+
+    monkeypatch.setattr(losses, "filtered", filtered)
+    monkeypatch.setattr(losses, "foreseen", foreseen)
+    objective = tuning.Objective(CONFIG, (("map", 1.0),))
+    value, slope = jax.value_and_grad(lambda params: objective(params, drives())[0])(OWN)
+    sums = 36 * float(OWN.R[0, 0])
+    assert float(value) == pytest.approx(float(OWN.l_occ) * sums, rel=1e-5)
+    assert float(slope.l_occ) == pytest.approx(sums, rel=1e-5)
+    assert not np.any(slope.R)
+
+
+def test_far_quantile_and_shares_are_the_documented_ones():
+    assert (losses.OUTLIER_SHARE, losses.LEVER) == (0.01, 1.0)
+    far = math.sqrt(scipy.stats.chi2.isf(1e-4, 2))
+    for beyond, expected in ((-0.01, far - 0.01), (0.0, far), (1.0, far + math.log(2))):
+        got = float(losses._distance(jnp.asarray((far + beyond) ** 2), 2))
+        assert got == pytest.approx(expected, rel=1e-5)
+    assert np.isfinite(float(jax.grad(lambda x: losses._distance(x, 2))(jnp.array(0.0))))
+
+
 # --- what cannot be judged
+
+
+def test_what_lies_in_steps_that_do_not_count_is_nothing_to_tune_on():
+    batch = drives()
+    odd = np.arange(12) % 2 == 1
+    valid = np.asarray(batch.inputs.valid)
+    assert valid.any()
+    for half in (odd, ~odd):
+        some = jnp.broadcast_to(jnp.asarray(half), (4, 12))
+        unseen = batch.inputs._replace(valid=jnp.asarray(valid & ~half[:, None]))
+        refused("expected an observation for the loss `nis`, got none", (("nis", 1.0),), counted=some, inputs=unseen)
+        refused("a step with a known pose for the loss `state`", (("state", 1.0),), counted=some, known=~some)
+    refused("expected scans", (("map", 1.0),), config=CONFIG, beam_angles=None)
+
+
+def test_a_gate_that_lets_in_only_what_does_not_count():
+    """What it refuses are the readings of the steps that count, 30 m off."""
+    batch = drives()
+    counted = jnp.broadcast_to(jnp.arange(12) >= 8, (4, 12))
+    off = np.where(np.arange(12) >= 8, 30.0, 0.0)[:, None, None] * np.array([1.0, 0.0])
+    z = np.asarray(batch.inputs.z) + off.astype(np.asarray(batch.inputs.z).dtype)
+    count = int(np.asarray(batch.inputs.valid)[:, 8:].sum())
+    refused(f"the gate refuses all {count} observations", counted=counted, inputs=batch.inputs._replace(z=z))
 
 
 def refused(match, objective=(("innovation", 1.0),), params=OWN, config=ONLY_POSES, **changes):
@@ -214,6 +318,8 @@ def test_a_start_that_is_not_finite():
         ((("speed", 1.0),), "expected one of .* got 'speed'"),
         ((("pose", 0.0),), "weight of pose: expected a positive number, got 0.0"),
         ((("pose", math.nan),), "weight of pose"),
+        ((("pose", math.inf),), "weight of pose"),
+        ((("pose", 1.0), ("nis", -1.0)), "weight of nis: expected a positive number, got -1.0"),
         ((("map", 1.0),), "config.grid: expected the GridSpec"),
     ],
 )
@@ -225,3 +331,28 @@ def test_an_objective_that_is_none(weights, message):
 def test_a_batch_that_does_not_fit_is_named():
     with pytest.raises(ValueError, match=r"batch.truth: expected shape \(4, 12, 3\), got \(4, 11, 3\)"):
         losses.pose(OWN, drives()._replace(truth=drives().truth[:, :11]), config=ONLY_POSES)
+    batch = drives()
+    for name, change in {
+        "counted": {"counted": batch.counted[0]},
+        "prior.mean": {"prior": batch.prior._replace(mean=batch.prior.mean[:3])},
+        "prior.cov": {"prior": batch.prior._replace(cov=batch.prior.cov[:3])},
+        "inputs.dt": {"inputs": batch.inputs._replace(dt=batch.inputs.dt[:, :5])},
+        "known": {"known": batch.known[:, :5]},
+        "poses": {"poses": batch.truth[..., :2]},
+    }.items():
+        with pytest.raises(ValueError, match=rf"^batch\.{name}: expected shape"):
+            check_batch(batch._replace(**change))
+
+
+@pytest.mark.parametrize("name", ["prior.mean", "truth", "poses", "landmarks"])
+def test_a_place_that_the_prior_s_dtype_cannot_hold_is_named(name):
+    batch = drives()
+    single = jax.tree.map(lambda x: np.asarray(x, np.float32), batch.prior)
+    places = {"truth": np.asarray(batch.truth), "landmarks": np.asarray(batch.landmarks)}
+    places["poses"] = places["truth"]
+    batch = batch._replace(prior=single, poses=places["poses"])
+    heading = single._replace(mean=single.mean + np.array([0, 0, 4e5], np.float32))
+    check_batch(batch._replace(prior=heading))  # of a heading nothing is asked
+    far = {"prior": single._replace(mean=single.mean + np.float32(4e5))}
+    with pytest.raises(ValueError, match=rf"^batch\.{name}: expected coordinates that float32 holds"):
+        check_batch(batch._replace(**far if name == "prior.mean" else {name: places[name] + 4e5}))

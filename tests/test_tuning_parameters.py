@@ -60,6 +60,17 @@ def test_a_coordinate_is_the_logarithm_of_a_deviation(tolerance):
     assert float(natural(constrain(longer))["w"]) == pytest.approx(0.15, rel=tolerance(1e-12, 1e-5))
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_limits_are_the_documented_ones(name, tolerance):
+    """1e-5 and 1e5 of each unit; correlations of 10 / sqrt(1 + 10²)."""
+    limit = 10 / 101**0.5 if name in ("v_w", "range_bearing") else None
+    level = {each: jnp.zeros(()) for each in NAMES}
+    for sign in (-1, 1):
+        got = float(natural(constrain(level | {name: jnp.array(sign * 99.0)}))[name])
+        expected = (sign * limit) if limit else (-1 if name == "l_free" else 1) * 1e5**sign
+        assert got == pytest.approx(expected, rel=tolerance(1e-9, 1e-4))
+
+
 def test_at_its_limit_a_coordinate_has_no_slope():
     at = unconstrain(TILTED) | {"v": jnp.asarray(100.0)}
     slope = jax.grad(lambda c: constrain(c).Q[0, 0])(at)

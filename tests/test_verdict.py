@@ -218,7 +218,146 @@ def test_no_finite_nees_is_not_consistent():
     assert text == "not consistent: no NEES is finite; 2 of 2 runs diverged"
 
 
+# --- Words at their borders ---
+
+
+def of_one_axis(relative, error, anees=3.0):
+    """Only x is off."""
+    return means(anees, (relative, 1.0, 1.0))._replace(
+        axis_nees=(mean(relative, error, 1.0), mean(1.0, error, 1.0), mean(1.0, error, 1.0))
+    )
+
+
+def of_one_run(anees, half, samples):
+    one = Mean(anees, 0.1, samples, (3 - half, 3 + half))
+    return means()._replace(nees=one, undiverged_nees=one)
+
+
+WIDER = [scipy.stats.t.ppf(0.999, n - 1) / scipy.stats.t.ppf(0.975, n - 1) for n in (60.0, 99.0)]
+
+
+@pytest.mark.parametrize(
+    ("of", "basis", "begins"),
+    [
+        # A misfit of 1 % is none to mind, one beyond is.
+        (scaled(1.0099, error=1e-3), {}, "consistent within 1 %"),
+        (scaled(1.0101, error=1e-3), {}, "over-confident"),
+        (scaled(0.9901, error=1e-3), {}, "consistent within 1 %"),
+        (scaled(0.9899, error=1e-3), {}, "under-confident"),
+        (scaled(1.005, error=1e-3), {"diverged": 1}, "over-confident"),
+        # An exact start or a gate may move the ANEES by a quarter, and an axis by a half.
+        (means(3 / 1.249, (0.8,) * 3), {"exact_start": True}, "undecided"),
+        (means(3 / 1.251, (0.8,) * 3), {"exact_start": True}, "under-confident"),
+        (means(3 * 1.249, (1.25,) * 3), {"gate": True}, "undecided"),
+        (means(3 * 1.251, (1.25,) * 3), {"gate": True}, "over-confident"),
+        (of_one_axis(1.499, 1e-3), {"gate": True}, "consistent"),
+        (of_one_axis(1.501, 1e-3), {"gate": True}, "not consistent"),
+        (of_one_axis(1 / 1.499, 1e-3), {"exact_start": True}, "consistent"),
+        (of_one_axis(1 / 1.501, 1e-3), {"exact_start": True}, "not consistent"),
+        # An axis is off by more than 5 % and beyond what one of a thousand reaches.
+        (of_one_axis(1.049, 1e-3), {}, "consistent"),
+        (of_one_axis(1.051, 1e-3), {}, "not consistent"),
+        (of_one_axis(1 / 1.049, 1e-3), {}, "consistent"),
+        (of_one_axis(1 / 1.051, 1e-3), {}, "not consistent"),
+        (of_one_axis(1 + 0.99 * scipy.stats.t.ppf(0.9995, 299) * 0.1, 0.1), {}, "consistent"),
+        (of_one_axis(1 + 1.01 * scipy.stats.t.ppf(0.9995, 299) * 0.1, 0.1), {}, "not consistent"),
+        # A band of a quarter of what is expected tells too little.
+        (of_one_run(3.0, 0.749, 500.0), {"runs": 1}, "consistent"),
+        (of_one_run(3.0, 0.751, 500.0), {"runs": 1}, "undecided"),
+        # From fewer than 100 independent samples of one run a band is what one in 500 lies beyond.
+        (of_one_run(3.0, 0.3, 100.0), {"runs": 1}, "consistent"),
+        (of_one_run(3.0, 0.3, 99.0), {"runs": 1}, "undecided"),
+        (of_one_run(3 + 0.99 * 0.3 * WIDER[0], 0.3, 60.0), {"runs": 1}, "undecided"),
+        (of_one_run(3 + 1.01 * 0.3 * WIDER[0], 0.3, 60.0), {"runs": 1}, "over-confident"),
+        (of_one_run(3 - 0.99 * 0.3 * WIDER[1], 0.3, 99.0), {"runs": 1}, "undecided"),
+        (of_one_run(3 - 1.01 * 0.3 * WIDER[1], 0.3, 99.0), {"runs": 1}, "under-confident"),
+        (of_one_run(3.31, 0.3, 100.0), {"runs": 1}, "over-confident"),
+    ],
+)
+def test_words_change_where_they_are_said_to(of, basis, begins):
+    assert said(of, **basis).startswith(f"{begins}: ")
+
+
+def test_twenty_steps_of_one_run_and_any_of_several_get_a_verdict():
+    assert not consistency.verdict(means(), Basis(runs=1, steps=20)).startswith("no verdict")
+    assert not consistency.verdict(means(), Basis(runs=2, steps=2)).startswith("no verdict")
+
+
+@pytest.mark.parametrize(("apart", "share"), [(1.049, True), (1.051, False)])
+def test_axes_within_5_percent_share_a_factor(apart, share):
+    assert ("covariance " in said(means(6.0, (2.0, 2.0, 2.0 * apart), error=1e-4))) == share
+
+
+@pytest.mark.parametrize(("times", "share"), [(0.98, True), (1.02, False)])
+def test_axes_share_a_factor_within_the_errors_of_their_ratio(times, share):
+    reach = scipy.stats.t.ppf(0.995, 299) * math.hypot(0.1, 0.1)
+    axes = (mean(2.0, 0.2, 1.0), mean(2.0, 0.2, 1.0), mean(2.0 * math.exp(times * reach), 0.2, 1.0))
+    errors = [axis._replace(standard_error=0.1 * axis.value) for axis in axes]
+    assert ("covariance " in said(means(6.0)._replace(axis_nees=tuple(errors)))) == share
+
+
+def test_correlations_alone_are_blamed_where_the_axes_are_unsure():
+    """ANEES 4, two axes apart by more than chance and neither beyond what one of a thousand reaches."""
+    axes = (mean(1.2, 0.07, 1.0), mean(0.85, 0.05, 1.0), mean(1.0, 0.01, 1.0))
+    text = said(means(4.0)._replace(axis_nees=axes))
+    assert text.startswith("over-confident: the axes alone agree, their correlations do not (ANEES 4, 3 expected, ")
+
+
+@pytest.mark.parametrize(("last", "named"), [(3.74, False), (3.76, True)])
+def test_a_phase_stands_out_by_a_quarter(last, named):
+    of = means(9.0, (3.0,) * 3, phases=(3.0, 3.0, 3.0, last), error=1e-3)
+    assert ("most so from 18.1 to 24 s" in said(of)) == named
+
+
+def test_a_phase_stands_out_beyond_its_errors():
+    reach = scipy.stats.t.ppf(0.995, 299) * math.hypot(0.6, 0.6)  # `means` gives phases twice the error
+    for times, named in ((0.98, False), (1.02, True)):
+        of = means(30.0, (10.0,) * 3, phases=(3.0, 3.0, 3.0, 3.0 + times * reach), error=0.3)
+        assert ("most so" in said(of)) == named
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(999.4, "999"), (1000.0, "1,000"), (12345.6, "12,346"), (999_999.4, "999,999"), (-2500.0, "-2,500")],
+)
+def test_numbers_are_readable(value, text):
+    assert consistency.readable(value) == text
+    assert consistency.readable(value / 1000, 4) == f"{value / 1000:.4g}"
+
+
 # --- The gate ---
+
+
+@pytest.mark.parametrize(
+    ("rejected", "observations", "streak", "words"),
+    [
+        (0, 19, 0, "the gate rejected"),  # of fewer than 20 nothing is said
+        (19, 19, 19, "the gate rejected"),
+        (20, 20, 20, "locked out: "),
+        (10, 100, 10, "locked out: "),  # ten one after the other, a tenth of all
+        (9, 90, 9, "too tight: "),
+        (11, 111, 11, "too tight: "),  # eleven, less than a tenth
+        (503, 1000, 0, "too tight: "),
+        (560, 1000, 0, "locked out: "),
+    ],
+)
+def test_a_gate_is_judged_from_20_observations_and_locked_by_a_streak_of_10(rejected, observations, streak, words):
+    assert consistency.gate_verdict(1 - rejected / observations, 0.99, observations, streak).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("rate", "nominal", "words"),
+    [
+        (0.8501, 0.9, "the gate"),
+        (0.8499, 0.9, "too tight: "),
+        (0.9332, 0.9, "the gate"),
+        (0.9334, 0.9, "too loose: "),
+        (0.4501, 0.9, "too tight: "),
+        (0.4499, 0.9, "locked out: "),
+    ],
+)
+def test_a_gate_is_off_by_half_as_many_refusals_again(rate, nominal, words):
+    assert consistency.gate_verdict(rate, nominal).startswith(words)
 
 
 @pytest.mark.parametrize(

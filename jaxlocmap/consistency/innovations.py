@@ -122,7 +122,8 @@ def _whiteness(white: np.ndarray, scored: np.ndarray, landmark: ArrayLike | None
         same = ids[1:] == ids[:-1]
         if same.any():
             before, after = values[:-1][same], values[1:][same]
-            correlations.append(2 * np.sum(before * after, axis=0) / np.sum(before**2 + after**2, axis=0))
+            squares = np.sum(before**2 + after**2, axis=0)
+            correlations.append(2 * np.sum(before * after, axis=0) / np.where(squares > 0, squares, 1))
             pairs += int(same.sum())
     each = np.reshape(correlations, (-1, size))
     correlation, reach = mean_lag_one(each.sum(0), np.square(each).sum(0), len(each), pairs)
