@@ -74,20 +74,20 @@ def is_red(rgba):
 @pytest.mark.parametrize(("probability", "said"), [(0.95, "95 %"), (0.5, "50 %")])
 def test_ellipses_hold_the_position_with_their_probability_and_lie_as_the_covariance_does(draw, probability, said):
     cov = np.tile(np.eye(3), (7, 1, 1))
-    cov[0, :2, :2], cov[6, :2, :2] = [[3, 1.6], [1.6, 1.2]], [[1, -0.9], [-0.9, 2]]
-    cov[3, 0, 0] = np.nan
+    cov[2, :2, :2], cov[6, :2, :2] = [[3, 1.6], [1.6, 1.2]], [[1, -0.9], [-0.9, 2]]
+    cov[0, 0, 0] = np.nan
     estimate = RNG.normal(size=(7, 3))
     figure = draw(
         plotting.trajectory_figure,
         *(estimate, cov, None),
         landmarks=np.zeros((1, 2)),
-        ellipses=3,
+        ellipses=4,
         probability=probability,
     )
     (ax,) = figure.axes
     patches = [patch for patch in ax.patches if isinstance(patch, Ellipse)]
-    assert len(patches) == 2  # of steps 0, 3 and 6; that of step 3 has no covariance
-    for patch, k in zip(patches, (0, 6), strict=True):
+    assert len(patches) == 3  # of steps 0, 2, 4 and 6; that of step 0 has no covariance
+    for patch, k in zip(patches, (2, 4, 6), strict=True):
         around = np.linspace(0, 2 * math.pi, 9)
         border = patch.get_patch_transform().transform(np.column_stack([np.cos(around), np.sin(around)]))
         away = border - estimate[k, :2]

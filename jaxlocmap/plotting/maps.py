@@ -41,18 +41,19 @@ def trajectory_figure(
     ax.plot(estimate[:, 0], estimate[:, 1], color=ESTIMATE, lw=1, label="estimate")
     ax.plot(landmarks[:, 0], landmarks[:, 1], "*", color=EXPECTED, ms=10, label="landmarks")
     reach = math.sqrt(chi2_quantile(probability, 2))
-    for i, k in enumerate(np.linspace(0, len(estimate) - 1, ellipses).astype(int)):
+    label = f"{100 * probability:.0f} % ellipses of the position"
+    for k in np.linspace(0, len(estimate) - 1, ellipses).astype(int):
         if not np.all(np.isfinite(cov[k])):
             continue
         variance, axes = np.linalg.eigh(cov[k, :2, :2])
         width, height = 2 * reach * np.sqrt(np.maximum(variance, 0))
         angle = math.degrees(math.atan2(axes[1, 0], axes[0, 0]))
-        label = f"{100 * probability:.0f} % ellipses of the position" if i == 0 else None
         ax.add_patch(
             Ellipse(
                 (estimate[k, 0], estimate[k, 1]), width, height, angle=angle, fill=False, color="tab:red", label=label
             )
         )
+        label = None
     ax.set(xlabel="x [m]", ylabel="y [m]", title=title)
     ax.set_aspect("equal", adjustable="datalim")  # a straight drive would leave no height
     figure.legend(fontsize=8, loc="outside lower center", ncols=5)
