@@ -18,7 +18,7 @@ from jaxlocmap import simulate
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import benchmark
-from baselines import course, cpp, peers, tables
+from baselines import course, cpp, peers, probe, tables
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
 SIZE = benchmark.Size(3, 2.0)
@@ -448,6 +448,36 @@ def test_the_peers_model_has_the_derivatives_it_says(x64):
     F = peers._move_jacobian(peers.PRIOR_MEAN)
     np.testing.assert_allclose(cov, F @ np.diag([0.04, 0.04, 0.01]) @ F.T + peers.Q, rtol=1e-12)
     np.testing.assert_allclose(mean, peers._moved(peers.PRIOR_MEAN), rtol=1e-12)
+
+
+def test_our_filter_among_the_peers_believes_what_the_model_says(x64):
+    del x64
+    runs, steps = jax.local_device_count(), 3
+    z = peers.drive(runs, steps, 1).z
+    mean, cov = map(np.asarray, peers._jaxlocmap(z)())
+    assert mean.shape == (runs, steps, 3)
+    for i in range(runs):
+        x, P = peers.PRIOR_MEAN, np.diag(peers.PRIOR_STD**2)
+        for k in range(steps):
+            F = peers._move_jacobian(x)
+            x, P = peers._moved(x), F @ P @ F.T + peers.Q
+            for j in range(4):  # one landmark after the other
+                rows = slice(2 * j, 2 * j + 2)
+                H, R = peers._see_jacobian(x)[rows], peers.R[rows, rows]
+                K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+                x = x + K @ peers._residual(z[i, k, rows].copy(), peers._seen(x)[rows])
+                P = P - K @ H @ P
+            np.testing.assert_allclose(cov[i, k], P, rtol=1e-6, atol=1e-10)
+            away = mean[i, k] - x
+            np.testing.assert_allclose([*away[:2], np.sin(away[2])], 0, rtol=0, atol=1e-8)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="only Linux has it")
+def test_a_peak_of_memory_is_what_was_held_at_most():
+    held = np.ones(2**25)  # 256 MiB
+    del held
+    now = int(next(line for line in Path("/proc/self/status").read_text().splitlines() if "VmRSS" in line).split()[1])
+    assert probe.peak_bytes() > 1024 * now + 2**27
 
 
 def test_drives_of_the_peers_start_where_the_prior_says_and_turn_as_the_noise_says():

@@ -145,6 +145,9 @@ def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
     consistency.main(dataclasses.replace(config, map=False, start="drawn"))
     assert len(pictured.calls) == 1
     assert json.loads((tmp_path / "report.json").read_text())["prior"] == "drawn"
+    for scenario, start in (("loop", "drawn"), ("capstone", "exact")):  # a scenario's own
+        report = consistency.main(dataclasses.replace(config, map=False, start=None, scenario=scenario))
+        assert report["prior"] == start
     written_by_process_0_alone(monkeypatch, consistency, config)
 
 
