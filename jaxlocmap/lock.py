@@ -38,9 +38,13 @@ class Lock:
             if path.exists() and os.path.samestat(os.fstat(handle), path.stat()):
                 break
             self._file.close()  # the one who had it has removed it
-        self._file.truncate()
-        json.dump({"process": os.getpid(), "host": socket.gethostname()}, self._file)
-        self._file.flush()
+        try:
+            self._file.truncate()
+            os.write(handle, json.dumps({"process": os.getpid(), "host": socket.gethostname()}).encode())
+        except OSError as error:
+            self.release()
+            error.filename = str(path)  # a full disk names no file
+            raise
 
     def release(self) -> None:
         """Give it free, and remove the file."""

@@ -17,6 +17,7 @@ from disks import full_disk
 
 from jaxlocmap import chunks
 from jaxlocmap import parts as parts_module
+from jaxlocmap.lock import Lock
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.parts import Parts, Split, manifest
 
@@ -298,6 +299,14 @@ def test_clearing_leaves_what_is_not_the_study_s(folder):
     (folder / "notes.txt").write_text("mine")
     parts.clear()
     assert [file.name for file in folder.iterdir()] == ["notes.txt"]
+
+
+def test_a_disk_too_full_for_a_lock_is_told_and_locks_nothing(tmp_path):
+    path = tmp_path / ".lock-0"
+    with full_disk(room=0), pytest.raises(OSError, match=f"File too large: '{path}'"):
+        Lock(path)
+    assert not path.exists()
+    Lock(path).release()
 
 
 def test_a_full_disk_is_told_and_keeps_what_is_kept(folder):
