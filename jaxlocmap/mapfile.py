@@ -19,6 +19,7 @@ from jaxlocmap.types import GridSpec
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1  # as in nav_msgs/OccupancyGrid
 _GREY = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}  # as map_saver writes them
+_PIXEL, _ROW = {"1": 1, "L": 1, "I;16": 2, "I;16B": 2}, 16  # bytes that Pillow takes, 4 for a pixel of another kind
 
 
 class LoadedMap(NamedTuple):
@@ -142,9 +143,6 @@ def load_map(path: str | Path) -> LoadedMap:
         cells = _read_picture(picture, sheet)[::-1]
     with files.reading(path, "a grid"):
         return LoadedMap(cells, GridSpec(origin=sheet.origin, resolution=sheet.resolution, shape=cells.shape))
-
-
-_PIXEL, _ROW = {"1": 1, "L": 1, "I;16": 2, "I;16B": 2}, 16  # bytes that Pillow takes
 
 
 class _Sheet(NamedTuple):

@@ -351,20 +351,21 @@ def _own_digest(study: Mapping[str, Any]) -> str:
 
 def _is_part(file: Path) -> bool:
     """Whether this is a part's file, damaged or not; an empty one holds nothing that could be lost."""
-    if not file.is_file():
-        return False
-    with file.open("rb") as stream:
-        begin = stream.read(len(_PART_MARK))
-    return begin in (_PART_MARK, b"")
+    return _begin(file, len(_PART_MARK)) in (_PART_MARK, b"")
 
 
 def _may_be_manifest(file: Path) -> bool:
     """Whether this may be what is left of a study's manifest."""
+    begin = _begin(file, 1000)
+    return begin == b"" or (begin is not None and _MARK.encode() in begin)
+
+
+def _begin(file: Path, count: int) -> bytes | None:
+    """The first bytes of a file; None of a folder, or of a pipe, which would be waited for."""
     if not file.is_file():
-        return False
+        return None
     with file.open("rb") as stream:
-        begin = stream.read(1000)
-    return not begin or _MARK.encode() in begin
+        return stream.read(count)
 
 
 def _sync(path: Path) -> None:

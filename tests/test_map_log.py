@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax
 import numpy as np
 import pytest
 import reference
@@ -22,12 +21,7 @@ sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import map_log
 import tune_sources
 
-
-@pytest.fixture(autouse=True)
-def as_a_program():
-    """Not in the strict session: a program makes its own."""
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        yield
+pytestmark = pytest.mark.usefixtures("as_a_program")
 
 
 @pytest.fixture(autouse=True)

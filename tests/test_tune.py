@@ -10,7 +10,6 @@ import threading
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 from test_experiments import is_png
@@ -27,11 +26,8 @@ CARMEN = {"log": Path("nowhere"), "format": "carmen", "loss": ("map",)}
 
 
 @pytest.fixture(autouse=True)
-def as_a_program(monkeypatch):
-    """Not in the strict session: a program makes its own. Its devices are those there are."""
+def on_the_devices_there_are(monkeypatch, as_a_program):
     monkeypatch.setattr(tune.hosts, "use_all_cores", lambda: None)
-    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
-        yield
 
 
 def tuned(folder, **settings):

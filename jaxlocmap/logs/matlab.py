@@ -54,11 +54,13 @@ def _read(path: str | Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     for name, content in _variables(path, data[_HEADER:], order):
         if name in names:
             try:
-                found[name] = _matrix(path, content, order)
+                values = _matrix(content, order)
             except ValueError as error:
-                if str(error).startswith(str(path)):
-                    raise
                 raise ValueError(f"{path}: {name}: {error}") from None
+            if 8 * values.size > files.most_bytes():
+                raise files.too_large(path, "numbers")
+            with np.errstate(invalid="ignore"):  # a NaN of another pattern is one all the same
+                found[name] = values.astype(np.float64)
     for name in names:
         if name not in found:
             raise ValueError(f"{path}: no variable {name}; expected {', '.join(names)}")
@@ -107,7 +109,8 @@ def _elements(data: bytes, order: _Order) -> Iterator[tuple[int, bytes]]:
         at = end if kind == _COMPRESSED else end + (-end % 8)  # all but compressed ones fill up to 8 bytes
 
 
-def _matrix(path: str | Path, content: bytes, order: _Order) -> np.ndarray:
+def _matrix(content: bytes, order: _Order) -> np.ndarray:
+    """The values as they are stored, without a copy."""
     parts = list(itertools.islice(_elements(content, order), 4))
     flags = int.from_bytes(parts[0][1][:4], order)
     kind = "complex" if flags & _COMPLEX else _CLASSES.get(flags & 0xFF, "unknown")
@@ -118,7 +121,4 @@ def _matrix(path: str | Path, content: bytes, order: _Order) -> np.ndarray:
     if not 2 <= len(shape) <= _DIMENSIONS or shape.min() < 0 or len(parts) < 4 or parts[3][0] not in _NUMBERS:
         raise ValueError(f"damaged: dimensions {shape[:_DIMENSIONS].tolist()}, {len(parts)} parts")
     values = np.frombuffer(parts[3][1], sign + _NUMBERS[parts[3][0]])
-    if 8 * values.size > files.most_bytes():
-        raise files.too_large(path, "numbers")
-    with np.errstate(invalid="ignore"):  # a NaN of another pattern is one all the same
-        return values.astype(np.float64).reshape(shape.tolist(), order="F")
+    return values.reshape(shape.tolist(), order="F")

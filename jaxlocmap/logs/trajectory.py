@@ -210,7 +210,8 @@ def _columns(line: str, where: str) -> list[str]:
 
 def _column(name: str) -> str:
     name = name.strip().strip('"')
-    ros = _ROS.fullmatch(name.lower(), max(name.lower().rfind("cov"), 0))
+    lower = name.lower()
+    ros = _ROS.fullmatch(lower, max(lower.rfind("cov"), 0))
     return f"cov_{int(ros[1])}" if ros else _ALIASES.get(name, name)
 
 
