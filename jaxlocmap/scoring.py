@@ -220,7 +220,8 @@ def run_totals(
     below = jnp.concatenate([average.nees < jnp.asarray(NEES_EDGES, dtype), jnp.full(1, scored)]) & scored
     bins = below.astype(dtype) - jnp.concatenate([jnp.zeros(1, dtype), below[:-1].astype(dtype)])
     paired, squares = sightings.lag_pairs > 0, sightings.lag_squares
-    lag_one = jnp.where(paired, sightings.lag_products / jnp.where(paired, squares, 1), 0)
+    # Zero where nothing is paired, or where all innovations are exactly zero.
+    lag_one = sightings.lag_products / jnp.where(squares > 0, squares, 1)
     return dict(
         runs=jnp.ones((), dtype),
         exact_starts=jnp.full((), exact_start, dtype),

@@ -86,7 +86,7 @@ def test_an_observation_is_paired_with_the_one_before_it():
     assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves((empty, latest)))
 
 
-def run(nees=3.0, count=8.0, lost=0.0, cov=1.0):
+def run(nees=3.0, count=8.0, lost=0.0, cov=1.0, lag=((1.0, -2.0), (2.0, 8.0))):
     """Steps of a run of eight, of which so many are scored, each with this NEES."""
     zero = jnp.zeros(())
     tally = scoring.no_steps(zero)._replace(
@@ -101,8 +101,8 @@ def run(nees=3.0, count=8.0, lost=0.0, cov=1.0):
     sightings = scoring.no_sightings(zero)._replace(
         observed=jnp.array(4.0),
         nis=jnp.array(6.0),
-        lag_products=jnp.array([1.0, -2.0]),
-        lag_squares=jnp.array([2.0, 8.0]),
+        lag_products=jnp.array(lag[0]),
+        lag_squares=jnp.array(lag[1]),
     )
     pairs = sightings._replace(lag_pairs=jnp.array(3.0))
     return totals(tally, pairs, jnp.zeros(3), Gaussian(jnp.zeros(3), cov * jnp.eye(3)))
@@ -121,6 +121,12 @@ def test_a_run_adds_its_averages_and_their_squares():
     ones = ("runs", "scored_runs", "undiverged_runs", "whole_runs", "observing_runs", "lag_runs")
     assert [float(got[name]) for name in ones] == [1] * 6
     assert (float(got["exact_starts"]), float(got["diverged"]), float(got["lag_pairs"])) == (0, 0, 3)
+
+
+def test_innovations_of_zero_are_not_correlated():
+    got = run(lag=((0.0, -2.0), (0.0, 8.0)))
+    np.testing.assert_allclose(got["lag_one"], [[0, -0.25], [0, 0.0625]], rtol=1e-6)
+    assert float(got["lag_runs"]) == 1
 
 
 @pytest.mark.parametrize(
