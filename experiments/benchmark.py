@@ -27,10 +27,10 @@ from baselines import course, cpp, peers, tables
 from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
 
 import jaxlocmap
-from jaxlocmap import files, hosts, simulate
-from jaxlocmap.hosts import check_count, merge_kernels, use_all_cores
-from jaxlocmap.monte_carlo import Result, monte_carlo
-from jaxlocmap.study import Study, summarise
+from jaxlocmap import files, simulation
+from jaxlocmap.consistency.study import Study, summarise
+from jaxlocmap.monte_carlo import Result, hosts, monte_carlo
+from jaxlocmap.monte_carlo.hosts import check_count, merge_kernels, use_all_cores
 
 Section = Literal["study", "filter", "devices", "cost"]
 _SECTIONS: tuple[Section, ...] = ("study", "filter", "devices", "cost")
@@ -155,9 +155,9 @@ def _long_enough(
 
 def _study(mapping: bool, seed: int, devices: list[Any]) -> Callable[[int], Result]:
     """The default study, as a function of the number of runs."""
-    scenario = simulate.CAPSTONE
+    scenario = simulation.CAPSTONE
     study = Study(scenario, scenario.config(grid=mapping))
-    scene = (simulate.course_params(), simulate.room(), simulate.Noise(), scenario.prior())
+    scene = (simulation.course_params(), simulation.room(), simulation.Noise(), scenario.prior())
     return lambda runs: monte_carlo(study, jax.random.key(seed), runs, *scene, devices=devices)
 
 
@@ -182,7 +182,7 @@ def _against_cpp(program: cpp.Program | None, mapping: bool, size: Size, seed: i
     study = _study(mapping, seed, jax.local_devices())
     start = size.runs // 10 if mapping else size.runs
     runs, first, last = _long_enough(study, lambda result: result.run_s, start, size.seconds)
-    ours = _statistics(summarise(last.value, simulate.CAPSTONE.config(grid=mapping)))
+    ours = _statistics(summarise(last.value, simulation.CAPSTONE.config(grid=mapping)))
     row = {"runs": runs, "chunk": last.chunk, "compile_s": first.compile_s, "statistics": ours}
 
     def speed() -> float:

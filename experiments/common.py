@@ -24,9 +24,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxlocmap import Params, files, hosts, simulate
-from jaxlocmap.monte_carlo import Result, monte_carlo
-from jaxlocmap.parts import Parts
+from jaxlocmap import Params, files, simulation
+from jaxlocmap.monte_carlo import Result, hosts, monte_carlo
+from jaxlocmap.monte_carlo.checkpoint import Parts
 
 _README = Path(__file__).parent.parent / "README.md"
 # A path or a name may hold what looks like markup.
@@ -180,15 +180,15 @@ def output_folder(path: Path) -> Path:
     return path
 
 
-def scenario_of(name: str) -> simulate.Scenario:
+def scenario_of(name: str) -> simulation.Scenario:
     """The scenario of that name.
 
     Raises:
         ValueError: there is none.
     """
-    if name not in simulate.SCENARIOS:
-        raise ValueError(f"scenario: expected one of {sorted(simulate.SCENARIOS)}, got {name!r}")
-    return simulate.SCENARIOS[name]
+    if name not in simulation.SCENARIOS:
+        raise ValueError(f"scenario: expected one of {sorted(simulation.SCENARIOS)}, got {name!r}")
+    return simulation.SCENARIOS[name]
 
 
 def check_gate(gate: float | None, name: str = "gate") -> None:

@@ -30,10 +30,10 @@ from common import (
 )
 from report_table import band, innovation_rows, pose_rows, print_verdicts
 
-from jaxlocmap import Config, Params, init, plotting, run, simulate
+from jaxlocmap import Config, Params, init, plotting, run, simulation
 from jaxlocmap.consistency import readable
+from jaxlocmap.consistency.study import Study, reference_study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.study import Study, reference_study, summarise
 
 _REFERENCE_RUNS = 2000, 20_000  # at least and at most
 
@@ -77,8 +77,8 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     runs = min(config.runs, 100) if config.quick else config.runs
     start(config.compute)
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=config.map)
-    params = params_or(config.params, simulate.course_params())
-    world, noise, prior = simulate.room(), simulate.Noise(), scenario.prior()
+    params = params_or(config.params, simulation.course_params())
+    world, noise, prior = simulation.room(), simulation.Noise(), scenario.prior()
     key = jax.random.key(config.seed)
     named = {name: getattr(config, name) for name in ("scenario", "motion", "gate", "start", "map", "seed")}
     parts = study_parts(out, config.compute, named)
@@ -110,23 +110,25 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     return report
 
 
-def _reference(scenario: simulate.Scenario, settings: Config, config: ConsistencyConfig, runs: int) -> Any:
+def _reference(scenario: simulation.Scenario, settings: Config, config: ConsistencyConfig, runs: int) -> Any:
     """What this start and this gate make of a filter told the robot's own noise; None where they make nothing of it."""
     if not scenario.exact_prior and config.gate is None:
         return None
-    noise, count = simulate.Noise(), min(max(runs, _REFERENCE_RUNS[0]), _REFERENCE_RUNS[1])
+    noise, count = simulation.Noise(), min(max(runs, _REFERENCE_RUNS[0]), _REFERENCE_RUNS[1])
     told, params = reference_study(scenario, settings, noise)
     key = jax.random.fold_in(jax.random.key(config.seed), 1)  # other drives, so that errors are independent
     devices = jax.local_devices()[: config.compute.devices]
     with progress_bar("simulating a filter told the robot's own noise", count) as progress:
-        args = params, simulate.room(), noise, scenario.prior()
+        args = params, simulation.room(), noise, scenario.prior()
         return monte_carlo(told, key, count, *args, devices=devices, progress=progress).value
 
 
-def _picture_of_one_run(path: Path, key: jax.Array, params: Params, scenario: simulate.Scenario, settings: Any) -> None:
+def _picture_of_one_run(
+    path: Path, key: jax.Array, params: Params, scenario: simulation.Scenario, settings: Any
+) -> None:
     """The map and path of one more run of the same study, started at the prior's mean."""
-    world, prior = simulate.room(), scenario.prior()
-    truth, inputs = simulate.simulate(key, world, simulate.Noise(), prior.mean, scenario=scenario)
+    world, prior = simulation.room(), scenario.prior()
+    truth, inputs = simulation.simulate(key, world, simulation.Noise(), prior.mean, scenario=scenario)
     state, beliefs = jax.jit(run, static_argnames=("config", "collect"))(
         params,
         init(prior, config=settings),

@@ -29,8 +29,8 @@ from report_table import innovation_rows, pose_rows, print_verdicts
 
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, consistency, init, plotting, run
 from jaxlocmap.consistency import readable
-from jaxlocmap.hosts import merge_kernels
 from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline, write_tum
+from jaxlocmap.monte_carlo.hosts import merge_kernels
 
 _PIECE = 2000  # steps between two moves of the progress bar
 

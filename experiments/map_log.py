@@ -15,11 +15,12 @@ import numpy as np
 import tyro
 from common import CONSOLE, command_line, count_rows, output_folder, params_or, progress_bar, saved, show, write_report
 
-from jaxlocmap import Config, GridSpec, Params, grid, map_scans, plotting
+from jaxlocmap import Config, GridSpec, Params, map_scans, plotting
 from jaxlocmap.logs import Log, read
-from jaxlocmap.mapfile import FREE, OCCUPIED, save_map
-from jaxlocmap.simulate import course_params
-from jaxlocmap.stages import map_spec
+from jaxlocmap.mapping import grid
+from jaxlocmap.mapping.ros import FREE, OCCUPIED, save_map
+from jaxlocmap.simulation import course_params
+from jaxlocmap.step import map_spec
 
 _PIECE = 91  # scans between two moves of the progress bar
 _MIN_RANGE = 0.05  # m, at or below is no measurement

@@ -17,10 +17,11 @@ import numpy as np
 from common import CONSOLE, ComputeConfig, command_line, output_folder, progress_bar, saved, start, write_report
 from rich.table import Table
 
-from jaxlocmap import Config, Gaussian, Inputs, Params, consistency, ekf, init, plotting, run, simulate
-from jaxlocmap import landmarks as sensor
-from jaxlocmap.batching import any_in_batch
-from jaxlocmap.linalg import Matrix, is_psd, ldl, solve
+from jaxlocmap import Config, Gaussian, Inputs, Params, consistency, init, plotting, run, simulation
+from jaxlocmap import sensors as sensor
+from jaxlocmap._internal.batching import any_in_batch
+from jaxlocmap._internal.linalg import Matrix, is_psd, ldl, solve
+from jaxlocmap.filters import ekf
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.motion import resolve
 
@@ -79,16 +80,16 @@ class Outcome(NamedTuple):
 class Precision:
     """One drive, simulated in float64 and filtered three times. Hashable, so `monte_carlo` compiles it once."""
 
-    scenario: simulate.Scenario
+    scenario: simulation.Scenario
     config: Config
 
     def __call__(
-        self, key: jax.Array, params: Params, world: simulate.World, noise: simulate.Noise, prior: Gaussian
+        self, key: jax.Array, params: Params, world: simulation.World, noise: simulation.Noise, prior: Gaussian
     ) -> Outcome:
         """Scores of the drive that `key` stands for; all arguments in float64."""
         start_key, key = jax.random.split(key)
-        first = prior.mean if self.scenario.exact_prior else simulate.draw_pose(start_key, prior)
-        drive = simulate.simulate(key, world, noise, first, scenario=self.scenario, scan=False)
+        first = prior.mean if self.scenario.exact_prior else simulation.draw_pose(start_key, prior)
+        drive = simulation.simulate(key, world, noise, first, scenario=self.scenario, scan=False)
         # Bin by bin, so that no filter's beliefs are kept for the whole drive.
         drive = jax.tree.map(lambda x: x.reshape(BINS, -1, *x.shape[1:]), drive)
 
@@ -232,18 +233,18 @@ def _check(config: PrecisionConfig) -> None:
 
 def _row(seed: int, steps: int, runs: int, sharper: float, progress: Any) -> dict[str, Any]:
     """One study: drives of one length with one detector."""
-    course = simulate.CAPSTONE
-    scenario = course if steps == course.steps else dataclasses.replace(simulate.LOOP, steps=steps)
-    noise = simulate.Noise()
+    course = simulation.CAPSTONE
+    scenario = course if steps == course.steps else dataclasses.replace(simulation.LOOP, steps=steps)
+    noise = simulation.Noise()
     noise = noise._replace(range=noise.range / sharper, bearing=noise.bearing / sharper)
     settings = scenario.config(motion="euler", gate_probability=None, grid=False)
     study = Precision(scenario, settings)
-    arguments = (simulate.own_params(noise, scenario.dt), simulate.room(), noise, scenario.prior())
+    arguments = (simulation.own_params(noise, scenario.dt), simulation.room(), noise, scenario.prior())
     result = monte_carlo(study, jax.random.key(seed), runs, *arguments, keep_runs=True, progress=progress)
     return summarise(result.value, scenario, sharper)
 
 
-def summarise(outcome: Outcome, scenario: simulate.Scenario, sharper: float) -> dict[str, Any]:
+def summarise(outcome: Outcome, scenario: simulation.Scenario, sharper: float) -> dict[str, Any]:
     """Statistics of each filter, and by how much it differs from the one in float64.
 
     Args:

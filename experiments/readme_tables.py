@@ -10,7 +10,7 @@ import consistency
 import localize
 from common import CONSOLE, command_line, output_folder, replace_table
 
-from jaxlocmap import simulate
+from jaxlocmap import simulation
 from jaxlocmap.consistency import readable
 
 _STUDIES: tuple[tuple[str, str, dict[str, Any]], ...] = (
@@ -70,7 +70,7 @@ def main(config: TablesConfig) -> dict[str, str]:
 
 def _studies(config: TablesConfig, out: Path) -> str:
     plant = out / "plant.json"
-    simulate.own_params(simulate.Noise(), simulate.CAPSTONE.dt).save(plant)
+    simulation.own_params(simulation.Noise(), simulation.CAPSTONE.dt).save(plant)
     rows = ["| the filter believes | arguments | ANEES (3) | x, y, yaw alone (1) | NIS (2) | gate lets in | verdict |"]
     rows.append("|---" * 7 + "|")
     for i, (what, arguments, settings) in enumerate(_STUDIES):

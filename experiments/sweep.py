@@ -36,17 +36,17 @@ from common import (
 )
 from rich.table import Table
 
-from jaxlocmap import Config, Gaussian, Params, plotting, simulate
-from jaxlocmap.batching import sum_over_runs
+from jaxlocmap import Config, Gaussian, Params, plotting, simulation
+from jaxlocmap._internal.batching import sum_over_runs
 from jaxlocmap.consistency import readable
-from jaxlocmap.study import Study, Totals, summarise
+from jaxlocmap.consistency.study import Study, Totals, summarise
 
 
 class Cell(NamedTuple):
     """What a cell of the grid may change."""
 
     params: Params
-    noise: simulate.Noise
+    noise: simulation.Noise
     gate_probability: jax.Array | None = None  # None: the study's own
 
 
@@ -155,8 +155,8 @@ class SweepStudy:
         x: jax.Array,
         y: jax.Array,
         params: Params,
-        world: simulate.World,
-        noise: simulate.Noise,
+        world: simulation.World,
+        noise: simulation.Noise,
         prior: Gaussian,
         **how: Any,
     ) -> Totals:
@@ -191,15 +191,15 @@ def main(config: SweepConfig) -> dict[str, Any]:
     start(config.compute)
     scenario = dataclasses.replace(scenario, outliers="outlier_rate" in (config.x, config.y))
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=False)
-    noise = simulate.Noise()
-    params = params_or(config.params, simulate.own_params(noise, scenario.dt))
+    noise = simulation.Noise()
+    params = params_or(config.params, simulation.own_params(noise, scenario.dt))
     named = {name: getattr(config, name) for name in ("x", "y", "scenario", "motion", "gate", "seed")}
     parts = study_parts(out, config.compute, named)
     CONSOLE.print(f"{len(x)} x {len(y)} cells, {runs} runs of {scenario.name} in each, {scenario.steps} steps")
 
     began = time.perf_counter()
     sweep = SweepStudy(Study(scenario, settings), config.x, config.y)
-    arguments = (jnp.array(x), jnp.array(y), params, simulate.room(), noise, scenario.prior())
+    arguments = (jnp.array(x), jnp.array(y), params, simulation.room(), noise, scenario.prior())
     result = study(sweep, jax.random.key(config.seed), runs, *arguments, config=config.compute, parts=parts)
     cells = []
     for i, j in np.ndindex(len(y), len(x)):

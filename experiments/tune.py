@@ -18,8 +18,9 @@ from rich.table import Table
 from tune_options import TuneConfig, checked, loss_weights, tuned_parameters
 from tune_sources import Source, Wanted, from_robots, from_scans, from_scenario
 
-from jaxlocmap import Params, hosts, plotting, tuning
+from jaxlocmap import Params, plotting, tuning
 from jaxlocmap.consistency import readable
+from jaxlocmap.monte_carlo import hosts
 
 _STEPS = {"lbfgs": 2, "adam": 20}  # an epoch
 _LOSS_WORDS = {

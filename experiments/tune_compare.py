@@ -27,16 +27,16 @@ from common import CONSOLE, command_line, output_folder, progress_bar, replace_t
 from jax.flatten_util import ravel_pytree
 from tune_sources import GATE_SOFTNESS, TUNING_GATE
 
-from jaxlocmap import Config, Gaussian, Inputs, Params, consistency, hosts, simulate, tuning
+from jaxlocmap import Config, Gaussian, Inputs, Params, consistency, simulation, tuning
 from jaxlocmap.consistency import readable
-from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.study import Study, summarise
+from jaxlocmap.consistency.study import Study, summarise
+from jaxlocmap.monte_carlo import hosts, monte_carlo
 
 _CLOSE = 1e-4  # nats: two losses this close are the same, a tenth of what 512 runs leave uncertain
 _LOSSES = ("state", "pose", "innovation", "nees", "nis")
 _TWO = ("range", "bearing")  # what `nees` and `nis` are tuned by, which tell no more than two
 _SURE = 1 / 3  # of the robot's own deviations: where the second comparison starts
-_STEADY = simulate.LOOP  # whose prior is honest: an exact start would let a filter win that does not look
+_STEADY = simulation.LOOP  # whose prior is honest: an exact start would let a filter win that does not look
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,9 @@ def main(config: CompareConfig) -> dict[str, Any]:
     runs, judge_runs = (16, 50) if config.quick else (config.runs, config.judge_runs)
     with jax.enable_x64(True):
         report = {
-            "optimisers": _optimisers(runs, _judge_on_fresh_runs(simulate.CAPSTONE, 0.99, judge_runs, config), config),
+            "optimisers": _optimisers(
+                runs, _judge_on_fresh_runs(simulation.CAPSTONE, 0.99, judge_runs, config), config
+            ),
             "losses": _losses(max(runs // 5, 8), _judge_on_fresh_runs(_STEADY, None, judge_runs // 5, config), config),
             "cost": _cost(runs, config.quick),
             "linear": _linear(config),
@@ -97,13 +99,13 @@ def main(config: CompareConfig) -> dict[str, Any]:
 
 
 def _judge_on_fresh_runs(
-    scenario: simulate.Scenario, gate: float | None, runs: int, config: CompareConfig
+    scenario: simulation.Scenario, gate: float | None, runs: int, config: CompareConfig
 ) -> Callable[[Params], dict[str, Any]]:
     settings = scenario.config(motion="euler", gate_probability=gate, grid=False)
     key = jax.random.fold_in(jax.random.key(config.seed), 9)
 
     def judge(params: Params) -> dict[str, Any]:
-        args = params, simulate.room(), simulate.Noise(), scenario.prior()
+        args = params, simulation.room(), simulation.Noise(), scenario.prior()
         args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), args)
         totals = monte_carlo(Study(scenario, settings), key, runs, *args)
         return summarise(totals.value, settings)
@@ -111,15 +113,15 @@ def _judge_on_fresh_runs(
     return judge
 
 
-def _drives(scenario: simulate.Scenario, runs: int, seed: int) -> tuning.Batch:
-    return tuning.simulated(jax.random.key(seed), runs, simulate.room(), simulate.Noise(), scenario=scenario)
+def _drives(scenario: simulation.Scenario, runs: int, seed: int) -> tuning.Batch:
+    return tuning.simulated(jax.random.key(seed), runs, simulation.room(), simulation.Noise(), scenario=scenario)
 
 
 def _optimisers(runs: int, judge: Callable[[Params], dict[str, Any]], config: CompareConfig) -> list[dict[str, Any]]:
-    settings = simulate.CAPSTONE.config(motion="euler", gate_probability=TUNING_GATE, grid=False)
+    settings = simulation.CAPSTONE.config(motion="euler", gate_probability=TUNING_GATE, grid=False)
     settings = dataclasses.replace(settings, gate_softness=GATE_SOFTNESS)
     objective = tuning.Objective(settings, (("innovation", 1.0),))
-    start, batch = simulate.course_params(), _drives(simulate.CAPSTONE, runs, config.seed)
+    start, batch = simulation.course_params(), _drives(simulation.CAPSTONE, runs, config.seed)
     ways = {
         "this library: L-BFGS, forward gradient": lambda: _ours(objective, start, batch, config.quick),
         "SciPy L-BFGS-B, our gradient": lambda: _scipy("L-BFGS-B", True, objective, start, batch, config.quick),
@@ -197,7 +199,7 @@ def _scipy(
 def _losses(runs: int, judge: Callable[[Params], dict[str, Any]], config: CompareConfig) -> list[dict[str, Any]]:
     settings = _STEADY.config(motion="euler", gate_probability=None, grid=False)
     batch = _drives(_STEADY, runs, config.seed)
-    own = simulate.own_params(simulate.Noise(), simulate.CAPSTONE.dt)
+    own = simulation.own_params(simulation.Noise(), simulation.CAPSTONE.dt)
     start = own._replace(Q=own.Q * _SURE**2, R=own.R * _SURE**2)
     rows = [_loss_row("the start", start, judge), _loss_row("the robot's own noise", own, judge)]
     losses = _LOSSES[:1] if config.quick else _LOSSES
@@ -221,9 +223,9 @@ def _loss_row(name: str, params: Params, judge: Callable[[Params], dict[str, Any
 
 def _cost(runs: int, quick: bool) -> dict[str, float]:
     filter_only = tuning.Objective(
-        simulate.CAPSTONE.config(motion="euler", gate_probability=TUNING_GATE, grid=False), (("innovation", 1.0),)
+        simulation.CAPSTONE.config(motion="euler", gate_probability=TUNING_GATE, grid=False), (("innovation", 1.0),)
     )
-    start, batch = simulate.course_params(), _drives(simulate.CAPSTONE, runs, 0)
+    start, batch = simulation.course_params(), _drives(simulation.CAPSTONE, runs, 0)
     whole = tuning.unconstrain(start)
     f = tuning.coordinates_objective(filter_only, start, tuning.NOISE)
     at = {name: whole[name] for name in tuning.NOISE}
@@ -250,16 +252,16 @@ def _cost(runs: int, quick: bool) -> dict[str, float]:
 
 def _bytes_a_run(steps: int, runs: int = 4) -> float:
     """Memory a run of the gradient of likelihood and map by all six parameters: data and everything in between."""
-    scenario = dataclasses.replace(simulate.CAPSTONE, steps=steps)
-    world, noise = simulate.room(), simulate.Noise()
+    scenario = dataclasses.replace(simulation.CAPSTONE, steps=steps)
+    world, noise = simulation.room(), simulation.Noise()
     settings = scenario.config(motion="euler", gate_probability=TUNING_GATE)
     objective = tuning.Objective(settings, (("innovation", 1.0), ("map", 1.0)))
     batch = jax.eval_shape(
         lambda key: tuning.simulated(key, runs, world, noise, scenario=scenario, scans=True), jax.random.key(0)
     )
     names = (*tuning.NOISE, *tuning.SENSOR_MODEL)
-    f = tuning.coordinates_objective(objective, simulate.course_params(), names)
-    whole = tuning.unconstrain(simulate.course_params())
+    f = tuning.coordinates_objective(objective, simulation.course_params(), names)
+    whole = tuning.unconstrain(simulation.course_params())
     slope = jax.value_and_grad(lambda at, batch: f(at, batch)[0])
     program = jax.jit(slope).lower({name: whole[name] for name in names}, batch).compile()
     memory: Any = program.memory_analysis()

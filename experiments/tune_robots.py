@@ -18,8 +18,9 @@ import numpy as np
 from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
 from tune_sources import JUDGE_GATE, TUNING_GATE, Source, Wanted, from_robots, from_scans
 
-from jaxlocmap import hosts, tuning
+from jaxlocmap import tuning
 from jaxlocmap.consistency import readable
+from jaxlocmap.monte_carlo import hosts
 
 _ROBOTS = (1, 2, 3, 4, 5)
 # What `nees` is tuned by, which tells no more than two: on the first half its loss falls from 28 to 0.06 by these, to

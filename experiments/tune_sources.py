@@ -15,12 +15,12 @@ from common import CONSOLE, scenario_of
 from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of, prior_at, time_sentences
 from map_log import first_scans, ready, say_doubts
 
-from jaxlocmap import Config, Gaussian, Params, simulate, tuning
-from jaxlocmap.foresight import Foresight
+from jaxlocmap import Config, Gaussian, Params, simulation, tuning
+from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline
+from jaxlocmap.mapping.predictive import Foresight
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.study import Study, summarise
-from jaxlocmap.world import random_room
+from jaxlocmap.simulation.world import random_room
 
 Evidence = dict[str, Any]
 TUNING_GATE, JUDGE_GATE = 0.9999, 0.99
@@ -65,14 +65,14 @@ def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wa
 
     With the loss `map`, rooms are drawn anew for every run, so that those judged are not those tuned on.
     """
-    scenario, noise = scenario_of(name), simulate.Noise()
+    scenario, noise = scenario_of(name), simulation.Noise()
     mapping = "map" in wanted.losses
     config = _tuning(scenario.config(motion=motion, gate_probability=wanted.gate, grid=mapping))
     key = jax.random.key(wanted.seed)
 
     def drives(i: int, count: int) -> tuning.Batch:
         drives_key, rooms_key = jax.random.split(jax.random.fold_in(key, i))
-        rooms = jax.vmap(random_room)(jax.random.split(rooms_key, count)) if mapping else simulate.room()
+        rooms = jax.vmap(random_room)(jax.random.split(rooms_key, count)) if mapping else simulation.room()
         return tuning.simulated(drives_key, count, rooms, noise, scenario=scenario, scans=mapping, worlds=mapping)
 
     held_out = drives(2, min(judge_runs, _HELD_OUT_WORLDS)) if mapping else None
@@ -80,7 +80,7 @@ def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wa
     study_runs = min(judge_runs, 200) if mapping else judge_runs
 
     def evidence(params: Params) -> Evidence:
-        args = params, simulate.room(), noise, scenario.prior()
+        args = params, simulation.room(), noise, scenario.prior()
         args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), args)
         totals = monte_carlo(Study(scenario, study_config), jax.random.fold_in(key, 3), study_runs, *args)
         report = summarise(totals.value, study_config)
@@ -90,8 +90,8 @@ def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wa
 
     train = drives(0, runs)
     # Where only the map is tuned the simulated robot knows its own noise: the map is to be judged, not the pose.
-    own = simulate.own_params(noise, scenario.dt)
-    start = simulate.course_params()
+    own = simulation.own_params(noise, scenario.dt)
+    start = simulation.course_params()
     if wanted.losses == ("map",):
         start = own._replace(l_occ=start.l_occ, l_free=start.l_free)
     return Source(
@@ -166,7 +166,7 @@ def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) 
     later = whole._replace(counted=(np.arange(scans) >= half)[None])
     return Source(
         f"{path.name}, first {half} of {scans} scans",
-        wanted.start or simulate.course_params(),
+        wanted.start or simulation.course_params(),
         config,
         train,
         validation,

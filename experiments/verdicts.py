@@ -16,15 +16,15 @@ import numpy as np
 from common import CONSOLE, command_line, output_folder, progress_bar, saved, write_report
 from rich.table import Table
 
-from jaxlocmap import Gaussian, Params, consistency, init, run, simulate
-from jaxlocmap.hosts import check_count, merge_kernels, use_all_cores
+from jaxlocmap import Gaussian, Params, consistency, init, run, simulation
+from jaxlocmap.consistency.scoring import Totals
+from jaxlocmap.consistency.study import pose_means, reference_study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.scoring import Totals
-from jaxlocmap.study import pose_means, reference_study, summarise
+from jaxlocmap.monte_carlo.hosts import check_count, merge_kernels, use_all_cores
 
 SCALES = (0.5, 0.8, 1.25, 2.0)  # of the covariance
 _REFERENCE_RUNS = 2000
-_LONG = dataclasses.replace(simulate.LOOP, name="long loop", steps=10_000)
+_LONG = dataclasses.replace(simulation.LOOP, name="long loop", steps=10_000)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,13 +54,15 @@ def main(config: VerdictsConfig) -> dict[str, Any]:
     key = jax.random.key(config.seed)
     rows = []
     for i, (scenario, exact, gate) in enumerate(
-        itertools.product((simulate.LOOP, simulate.CAPSTONE), (False, True), (None, 0.99))
+        itertools.product((simulation.LOOP, simulation.CAPSTONE), (False, True), (None, 0.99))
     ):
         where = dataclasses.replace(scenario, exact_prior=exact)
         rows.append(_studies(jax.random.fold_in(key, i), where, gate, count, runs))
     singles = [
         _single_runs(jax.random.fold_in(key, 100 + i), scenario, count)
-        for i, scenario in enumerate((_LONG, simulate.LOOP, dataclasses.replace(simulate.CAPSTONE, exact_prior=False)))
+        for i, scenario in enumerate(
+            (_LONG, simulation.LOOP, dataclasses.replace(simulation.CAPSTONE, exact_prior=False))
+        )
     ]
     report = {"studies": count, "runs": runs, "settings": rows, "single_runs": singles, "seed": config.seed}
     write_report(out, report)
@@ -69,9 +71,11 @@ def main(config: VerdictsConfig) -> dict[str, Any]:
     return report
 
 
-def _studies(key: jax.Array, scenario: simulate.Scenario, gate: float | None, count: int, runs: int) -> dict[str, Any]:
+def _studies(
+    key: jax.Array, scenario: simulation.Scenario, gate: float | None, count: int, runs: int
+) -> dict[str, Any]:
     """Studies of one setting, judged with and without a reference of the same setting."""
-    noise, world, prior = simulate.Noise(), simulate.room(), scenario.prior()
+    noise, world, prior = simulation.Noise(), simulation.room(), scenario.prior()
     settings = scenario.config(motion="euler", gate_probability=gate, grid=False)
     study, params = reference_study(scenario, settings, noise)
     args = params, world, noise, prior
@@ -167,14 +171,14 @@ def _held(values: np.ndarray) -> float:
 class Single:
     """One run, kept: truth and beliefs. Hashable, so that it compiles once."""
 
-    scenario: simulate.Scenario
+    scenario: simulation.Scenario
 
     def __call__(self, key: jax.Array, params: Params, world: Any, noise: Any, prior: Gaussian) -> Any:
         """The true poses (T, 3) and the beliefs of the run that `key` stands for."""
         config = self.scenario.config(motion="euler", gate_probability=None, grid=False)
         start_key, key = jax.random.split(key)
-        start = prior.mean if self.scenario.exact_prior else simulate.draw_pose(start_key, prior)
-        truth, inputs = simulate.simulate(key, world, noise, start, scenario=self.scenario, scan=False)
+        start = prior.mean if self.scenario.exact_prior else simulation.draw_pose(start_key, prior)
+        truth, inputs = simulation.simulate(key, world, noise, start, scenario=self.scenario, scan=False)
         state = init(prior, config=config)
         beliefs = run(params, state, inputs, landmarks=world.landmarks, config=config, collect=_belief)[1]
         return truth.pose, beliefs
@@ -185,10 +189,10 @@ def _belief(state: Any, info: Any, aside: Any) -> Gaussian:
     return info.belief
 
 
-def _single_runs(key: jax.Array, scenario: simulate.Scenario, count: int) -> dict[str, Any]:
+def _single_runs(key: jax.Array, scenario: simulation.Scenario, count: int) -> dict[str, Any]:
     """Single runs of an honest filter, each judged alone."""
-    noise = simulate.Noise()
-    args = simulate.own_params(noise, scenario.dt), simulate.room(), noise, scenario.prior()
+    noise = simulation.Noise()
+    args = simulation.own_params(noise, scenario.dt), simulation.room(), noise, scenario.prior()
     held, verdicts, samples, mean = 0, [], [], []
     with progress_bar(f"single runs of {scenario.name}", count) as progress:
         for n in range(count):

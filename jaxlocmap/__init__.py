@@ -1,6 +1,8 @@
 """Localisation and mapping whose covariance can be believed, or shown not to be: a pure-functional JAX library."""
 
-from jaxlocmap import consistency, ekf, grid, landmarks, motion, simulate
+from jaxlocmap import consistency, motion, sensors, simulation
+from jaxlocmap.filters import ekf
+from jaxlocmap.mapping import grid
 from jaxlocmap.motion import MotionModel
 from jaxlocmap.pipeline import init, map_scans, run, step
 from jaxlocmap.types import Config, Gaussian, GridSpec, Info, Inputs, Params, State, Truth
@@ -19,10 +21,10 @@ __all__ = [
     "ekf",
     "grid",
     "init",
-    "landmarks",
     "map_scans",
     "motion",
     "run",
-    "simulate",
+    "sensors",
+    "simulation",
     "step",
 ]

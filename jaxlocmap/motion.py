@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap.linalg import Matrix
-from jaxlocmap.trig import sin_cos
+from jaxlocmap._internal.linalg import Matrix
+from jaxlocmap._internal.trig import sin_cos
 
 
 class MotionModel(NamedTuple):

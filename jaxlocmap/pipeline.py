@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import checks, grid
-from jaxlocmap import landmarks as sensor
-from jaxlocmap.batching import any_in_batch, cond, scan, zero_like_any
-from jaxlocmap.stages import Sighting, correct, is_measurement, map_scan, map_spec, predict, sound
+from jaxlocmap import checks
+from jaxlocmap import sensors as sensor
+from jaxlocmap._internal.batching import any_in_batch, cond, scan, zero_like_any
+from jaxlocmap.mapping import grid
+from jaxlocmap.step import Sighting, correct, is_measurement, map_scan, map_spec, predict, sound
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
 
 # rad², of a heading that is uniform on the circle.

@@ -5,11 +5,11 @@ import functools
 
 import jax
 
-from jaxlocmap import GridSpec, simulate, tuning
+from jaxlocmap import GridSpec, simulation, tuning
 
 # In sight of all four landmarks, which the detector looks for in every second step.
 SHORT = dataclasses.replace(
-    simulate.CAPSTONE,
+    simulation.CAPSTONE,
     name="short",
     start=(6.0, 8.5, 0.5),
     steps=12,
@@ -17,7 +17,7 @@ SHORT = dataclasses.replace(
     sight_period=2,
     grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20)),
 )
-OWN = simulate.own_params(simulate.Noise(), SHORT.dt)
+OWN = simulation.own_params(simulation.Noise(), SHORT.dt)
 CONFIG = SHORT.config(motion="euler", gate_probability=0.9999)
 ONLY_POSES = SHORT.config(motion="euler", gate_probability=0.9999, grid=False)
 
@@ -26,7 +26,7 @@ ONLY_POSES = SHORT.config(motion="euler", gate_probability=0.9999, grid=False)
 def _simulated(runs, seed):
     with jax.ensure_compile_time_eval():  # kept, so no part of whatever is traced when it is first asked for
         return tuning.simulated(
-            jax.random.key(seed), runs, simulate.room(), simulate.Noise(), scenario=SHORT, scans=True
+            jax.random.key(seed), runs, simulation.room(), simulation.Noise(), scenario=SHORT, scans=True
         )
 
 

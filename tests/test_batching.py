@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxlocmap import batching
+from jaxlocmap._internal import batching
 
 
 class Carry(NamedTuple):

@@ -11,7 +11,7 @@ import pytest
 import reference
 from programs import ON_CPU
 
-from jaxlocmap import ekf
+from jaxlocmap.filters import ekf
 
 pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"

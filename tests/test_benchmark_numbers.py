@@ -14,7 +14,7 @@ import pytest
 import reference
 from programs import Recorder, stop
 
-from jaxlocmap import simulate
+from jaxlocmap import simulation
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import benchmark
@@ -91,10 +91,10 @@ def test_the_benchmark_runs_the_default_study(monkeypatch, mapping):
     monkeypatch.setattr(benchmark, "monte_carlo", ran := Recorder("result"))
     assert benchmark._study(mapping, 7, ["device"])(99) == "result"
     ((study, key, runs, params, *_), how) = ran.calls[0]
-    assert (study.scenario, study.config) == (simulate.CAPSTONE, simulate.CAPSTONE.config(grid=mapping))
+    assert (study.scenario, study.config) == (simulation.CAPSTONE, simulation.CAPSTONE.config(grid=mapping))
     assert (runs, how) == (99, {"devices": ["device"]})
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(jax.random.key(7)))
-    np.testing.assert_array_equal(params.R, simulate.course_params().R)
+    np.testing.assert_array_equal(params.R, simulation.course_params().R)
 
 
 def test_studies_with_and_without_maps_and_the_course_s_runs(monkeypatch, tmp_path):
@@ -135,7 +135,7 @@ def test_a_study_is_compared_at_the_same_work(monkeypatch, mapping, least, progr
     monkeypatch.setattr(benchmark.hosts, "cores", lambda: 6)
     row = benchmark._against_cpp(program, mapping, SIZE, 7)
     assert asked.calls == [((mapping, 7, jax.local_devices()), {})]
-    assert told.calls == [(("totals", simulate.CAPSTONE.config(grid=mapping)), {})]
+    assert told.calls == [(("totals", simulation.CAPSTONE.config(grid=mapping)), {})]
     assert {args for args, _ in ran.calls} == {(least,)}
     assert (row["runs"], row["chunk"], row["compile_s"]) == (least, 16, 0.5)
     assert row["statistics"] == {"of": "summary"}

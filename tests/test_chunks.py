@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import chunks, simulate
-from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.parts import Parts
-from jaxlocmap.study import Study
+from jaxlocmap import simulation
+from jaxlocmap.consistency.study import Study
+from jaxlocmap.monte_carlo import chunks, monte_carlo
+from jaxlocmap.monte_carlo.checkpoint import Parts
 
 KEY = jax.random.key(0)
 DEVICES = tuple(jax.local_devices()[:1])
@@ -60,10 +60,10 @@ def test_a_run_that_says_nothing_or_carries_nothing_gets_the_largest_chunk(limit
 
 @pytest.mark.parametrize("mapping", [False, True])
 def test_a_study_says_what_its_map_takes(mapping):
-    scenario = simulate.CAPSTONE
+    scenario = simulation.CAPSTONE
     config = scenario.config(grid=mapping)
     prior = jax.tree.map(lambda x: x.astype(jnp.float32), scenario.prior())
-    run = run_of(Study(scenario, config), simulate.course_params(), simulate.room(), simulate.Noise(), prior)
+    run = run_of(Study(scenario, config), simulation.course_params(), simulation.room(), simulation.Noise(), prior)
     # Mean and covariance, the log-likelihood, and the map: written once and read once.
     size = 4 * (3 + 9 + 1 + (np.prod(config.grid.shape) if mapping else 0))
     for limits in (chunks.CPU, chunks.ACCELERATOR):

@@ -12,7 +12,7 @@ import pytest
 from programs import Recorder, stop
 from scipy.stats import chi2
 
-from jaxlocmap import Config, Gaussian, Params, simulate, tuning
+from jaxlocmap import Config, Gaussian, Params, simulation, tuning
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import readme_tables
@@ -73,8 +73,8 @@ def test_options_of_the_comparison(monkeypatch, tmp_path, options, runs, losses,
     tune_compare.main(config)
     assert parts["replace_table"].calls == []
     assert [args for args, _ in parts["_judge_on_fresh_runs"].calls] == [
-        (simulate.CAPSTONE, 0.99, judged[0], config),
-        (simulate.LOOP, None, judged[1], config),
+        (simulation.CAPSTONE, 0.99, judged[0], config),
+        (simulation.LOOP, None, judged[1], config),
     ]
     assert parts["_optimisers"].calls == [((runs, "judge", config), {})]
     assert parts["_losses"].calls == [((losses, "judge", config), {})]
@@ -110,16 +110,16 @@ def test_fresh_runs_are_not_those_tuned_on(monkeypatch):
     monkeypatch.setattr(tune_compare, "summarise", told)
     monkeypatch.setattr(tuning, "simulated", drawn := Recorder("batch"))
     config = tune_compare.CompareConfig(seed=5)
-    assert tune_compare._judge_on_fresh_runs(simulate.LOOP, 0.9, 70, config)(A) == {"anees": 3}
+    assert tune_compare._judge_on_fresh_runs(simulation.LOOP, 0.9, 70, config)(A) == {"anees": 3}
     ((study, key, runs, params, *_), _) = ran.calls[0]
-    assert (study.scenario, study.config.motion, study.config.gate_probability) == (simulate.LOOP, "euler", 0.9)
+    assert (study.scenario, study.config.motion, study.config.gate_probability) == (simulation.LOOP, "euler", 0.9)
     assert (study.config.grid, runs, params.R.dtype) == (None, 70, np.float32)
     np.testing.assert_allclose(params.R, A.R, rtol=1e-6)
     assert key_data(key) == key_data(jax.random.fold_in(jax.random.key(5), 9))
     assert told.calls == [(("totals", study.config), {})]
-    assert tune_compare._drives(simulate.LOOP, 9, 5) == "batch"
+    assert tune_compare._drives(simulation.LOOP, 9, 5) == "batch"
     ((key, runs, *_), how) = drawn.calls[0]
-    assert (key_data(key), runs, how) == (key_data(jax.random.key(5)), 9, {"scenario": simulate.LOOP})
+    assert (key_data(key), runs, how) == (key_data(jax.random.key(5)), 9, {"scenario": simulation.LOOP})
 
 
 @pytest.mark.parametrize("quick", [False, True])
@@ -154,8 +154,8 @@ def test_optimisers_are_compared_by_when_they_reach_the_best(monkeypatch, quick,
     for objective, start, batch, short in given:
         assert (objective.weights, short) == ((("innovation", 1.0),), quick)
         assert (objective.config.gate_probability, objective.config.gate_softness) == (0.9999, 2.0)
-        np.testing.assert_array_equal(start.R, simulate.course_params().R)
-        assert batch == (simulate.CAPSTONE, 30, 5)
+        np.testing.assert_array_equal(start.R, simulation.course_params().R)
+        assert batch == (simulation.CAPSTONE, 30, 5)
 
 
 @pytest.mark.parametrize(("quick", "epochs"), [(False, 20), (True, 2)])
@@ -213,7 +213,7 @@ def test_losses_are_compared_from_a_start_three_times_too_sure(monkeypatch, fits
     judged = Recorder({name: 1.0 for name in ("rmse_position_m", "rmse_yaw_rad", "anees", "nis_mean", "coverage_95")})
     monkeypatch.setattr(tune_compare, "_drives", lambda *args: args)
     rows = tune_compare._losses(8, judged, tune_compare.CompareConfig(seed=5, quick=quick))
-    own = simulate.own_params(simulate.Noise(), 0.1)
+    own = simulation.own_params(simulation.Noise(), 0.1)
     (start,), (told,) = (args for args, _ in judged.calls[:2])
     for name in ("Q", "R"):
         np.testing.assert_allclose(getattr(told, name), getattr(own, name), rtol=1e-6)
@@ -226,7 +226,7 @@ def test_losses_are_compared_from_a_start_three_times_too_sure(monkeypatch, fits
     for ((objective, begun, batch), how), name in zip(
         fits.calls, ("state", "pose", "innovation", "nees", "nis"), strict=False
     ):
-        assert (objective.weights, begun, batch) == (((name, 1.0),), start, (simulate.LOOP, 8, 5))
+        assert (objective.weights, begun, batch) == (((name, 1.0),), start, (simulation.LOOP, 8, 5))
         tuned = ("range", "bearing") if name in ("nees", "nis") else tuning.NOISE
         assert how == {"tuned": tuned, "epochs": 1 if quick else 20}
         assert (objective.config.gate_probability, objective.config.motion) == (None, "euler")
@@ -551,7 +551,7 @@ def test_the_studies_of_the_readme(monkeypatch, tmp_path, quick):
     rows = rows_of(readme_tables._studies(config, tmp_path))
     plant = tmp_path / "plant.json"
     np.testing.assert_allclose(
-        Params.load(plant).Q, simulate.own_params(simulate.Noise(), 0.1).Q, rtol=1e-6, atol=1e-12
+        Params.load(plant).Q, simulation.own_params(simulation.Noise(), 0.1).Q, rtol=1e-6, atol=1e-12
     )
     configs = [args[0] for args, _ in ran.calls]
     assert {(c.runs, c.map, c.seed, c.quick) for c in configs} == {(70, False, 4, quick)}

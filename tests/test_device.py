@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import reference
 
-from jaxlocmap import GridSpec, beams, grid, normals
+from jaxlocmap import GridSpec
+from jaxlocmap._internal import random
+from jaxlocmap.mapping import grid, rays
 
 SIDE = 401
 SPEC = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(SIDE, SIDE - 1))
@@ -22,10 +24,10 @@ both_forms = pytest.mark.parametrize("max_range", [1000.0, 5000.0], ids=["float3
 
 @functools.partial(jax.jit, static_argnames="max_range")
 def placed(pose, ranges, angles, *, max_range):
-    lines = beams.trace(pose, ranges, angles, spec=SPEC, min_range=0.0, max_range=max_range)
+    lines = rays.trace(pose, ranges, angles, spec=SPEC, min_range=0.0, max_range=max_range)
     j = jnp.arange(SIDE, dtype=jnp.int32)[None]
     ends = lines.last[:, None]
-    return lines, beams.cells_at(lines, j), beams.flat_cells(lines, j, SPEC), beams.flat_cells(lines, ends, SPEC)
+    return lines, rays.cells_at(lines, j), rays.flat_cells(lines, j, SPEC), rays.flat_cells(lines, ends, SPEC)
 
 
 @both_forms
@@ -64,14 +66,14 @@ def test_long_quotients_are_those_of_64_bits():
     rng = np.random.default_rng(1)
     a, c = rng.integers(0, 2**20, 4096, endpoint=True), rng.integers(1, 2**21, 4096, endpoint=True)
     b = rng.integers(0, c, endpoint=True)
-    got = jax.jit(beams._times_over)(*(jnp.asarray(x, jnp.int32) for x in (a, b, c)))
+    got = jax.jit(rays._times_over)(*(jnp.asarray(x, jnp.int32) for x in (a, b, c)))
     np.testing.assert_array_equal(got, np.divmod(a * b, c))
 
 
 def test_points_far_outside_stay_there():
     """The clamp of a cell's index."""
     x = np.array([-np.inf, -1e30, -1e6, -0.5, 0.5, 1e6, 1e30, np.inf, np.nan])
-    got = jax.jit(lambda point: beams.cell_of(point, SPEC))(jnp.asarray(np.stack([x, x], axis=-1)))
+    got = jax.jit(lambda point: rays.cell_of(point, SPEC))(jnp.asarray(np.stack([x, x], axis=-1)))
     expected = [-(2**29), -(2**29), -(10**6), -1, 0, 10**6, 2**29, 2**29, -(2**29)]
     np.testing.assert_array_equal(got, np.stack([expected, expected], axis=-1))
 
@@ -85,7 +87,7 @@ def test_the_words_of_the_generator_are_numpys():
             a = a + b
             b = a ^ ((b << np.uint32(distance)) | (b >> np.uint32(32 - distance)))
         a, b = a + keys[(group + 1) % 3], b + keys[(group + 2) % 3] + np.uint32(group + 1)
-    np.testing.assert_array_equal(jax.jit(normals.threefry)(tuple(key), tuple(counter)), [a, b])
+    np.testing.assert_array_equal(jax.jit(random.threefry)(tuple(key), tuple(counter)), [a, b])
 
 
 def test_cells_are_counted_by_probability_as_numpy_does():

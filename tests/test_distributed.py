@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from programs import WALKS, ended, free_port, is_free, report, result, start
 
-from jaxlocmap import hosts
+from jaxlocmap.monte_carlo import hosts
 
 pytestmark = pytest.mark.slow
 
@@ -93,7 +93,7 @@ def test_processes_with_different_settings_refuse_each_other(tmp_path):
 JOIN = """
 import sys
 from common import command_line
-from jaxlocmap import hosts
+from jaxlocmap.monte_carlo import hosts
 
 def main(config):
     hosts.join(f"127.0.0.1:{sys.argv[1]}", 2, int(sys.argv[2]), timeout=2)

@@ -13,7 +13,8 @@ import scipy.stats
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from jaxlocmap import Config, Gaussian, Inputs, Params, ekf, init, landmarks, motion, run
+from jaxlocmap import Config, Gaussian, Inputs, Params, init, motion, run, sensors
+from jaxlocmap.filters import ekf
 
 MEAN = np.array([0.4, -0.3, 3.1])
 COV = np.array([[0.05, 0.01, 0.004], [0.01, 0.04, -0.003], [0.004, -0.003, 0.02]])
@@ -168,7 +169,7 @@ def test_course_problem_4_the_99_percent_gate_in_two_dimensions(distance, accept
 def test_a_correction_by_a_landmark_is_the_reference(gate, offset, tolerance):
     z, landmark = np.array([3.4, -2.9]), np.array([3.0, 2.0])
     mean, cov, noise = (jnp.array(x) for x in (MEAN, COV, R))
-    residual, H, defined = landmarks.linearise(mean, jnp.array(landmark), jnp.array(z), offset)
+    residual, H, defined = sensors.linearise(mean, jnp.array(landmark), jnp.array(z), offset)
     assert defined
     got = ekf.update(mean, cov, residual, H, noise, threshold=math.inf if gate is None else gate)
     expected = reference.correct(MEAN, COV, z, landmark, R, gate, offset)

@@ -148,7 +148,7 @@ def test_localize_needs_a_start_where_there_is_no_truth(tmp_path):
 
 
 def test_map_log_maps_a_real_building(tmp_path):
-    from jaxlocmap.mapfile import FREE, OCCUPIED, load_map
+    from jaxlocmap.mapping.ros import FREE, OCCUPIED, load_map
 
     intel = data("carmen", "intel-corrected.log.gz")
     status, output = run("map_log", intel, "--format", "carmen", "--resolution", 0.1, "--quick", "--out", tmp_path)

@@ -26,13 +26,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import EpsImagePlugin, Image
 from test_logs import MRCLAM, woods
-from test_parts import ARRAYS, STUDY
+from test_checkpoint import ARRAYS, STUDY
 
 from jaxlocmap import Params, logs
-from jaxlocmap.lock import Lock
 from jaxlocmap.logs.matlab import read_matrices
-from jaxlocmap.mapfile import load_map
-from jaxlocmap.parts import Parts, _own_digest
+from jaxlocmap.mapping.ros import load_map
+from jaxlocmap.monte_carlo.checkpoint import Parts, _own_digest
+from jaxlocmap.monte_carlo.lock import Lock
 
 INPUTS = int(os.environ.get("JAXLOCMAP_FUZZ", "2000"))
 LONGEST, MOST, WORDS = 5, 2**20, 2000  # s of the processor for a file, KiB for all, characters of a message

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from programs import free_port
 
-from jaxlocmap import hosts
-from jaxlocmap.monte_carlo import _exchange, monte_carlo
-from jaxlocmap.parts import Parts
+from jaxlocmap.monte_carlo import hosts
+from jaxlocmap.monte_carlo.checkpoint import Parts
+from jaxlocmap.monte_carlo.run import _exchange, monte_carlo
 
 
 @pytest.mark.parametrize(

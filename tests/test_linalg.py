@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlocmap.linalg import Matrix, forward, is_psd, ldl, mahalanobis, sandwich, solve, stack
+from jaxlocmap._internal.linalg import Matrix, forward, is_psd, ldl, mahalanobis, sandwich, solve, stack
 
 
 def random_psd(rng, n, rank=None):

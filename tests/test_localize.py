@@ -14,7 +14,8 @@ import pytest
 import reference
 from programs import Enough, Recorder
 
-from jaxlocmap import Config, Info, Inputs, Params, ekf
+from jaxlocmap import Config, Info, Inputs, Params
+from jaxlocmap.filters import ekf
 from jaxlocmap.logs import Log, Timeline
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))

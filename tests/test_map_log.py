@@ -15,7 +15,7 @@ from test_experiments import is_png
 from test_logs import flaser, refused, write
 
 from jaxlocmap import Params
-from jaxlocmap.mapfile import OCCUPIED, load_map
+from jaxlocmap.mapping.ros import OCCUPIED, load_map
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import map_log

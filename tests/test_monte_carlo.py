@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import batching, chunks, hosts
-from jaxlocmap.monte_carlo import monte_carlo, use_all_cores
+from jaxlocmap._internal import batching
+from jaxlocmap.monte_carlo import chunks, hosts, monte_carlo, use_all_cores
 
 
 class Outcome(NamedTuple):

@@ -13,8 +13,9 @@ import reference
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlocmap import ekf, motion
-from jaxlocmap.linalg import Matrix
+from jaxlocmap import motion
+from jaxlocmap._internal.linalg import Matrix
+from jaxlocmap.filters import ekf
 
 OMEGAS = (0.0, 1e-9, -1e-9, 1e-4, 0.3, -0.3, 40.0)
 PERIODS = (0.0, 1e-3, 0.1, 1.0)

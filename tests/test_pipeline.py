@@ -13,22 +13,9 @@ import reference
 from jax.sharding import Mesh, PartitionSpec
 from jax.test_util import check_grads
 
-from jaxlocmap import (
-    Config,
-    Gaussian,
-    GridSpec,
-    Inputs,
-    Params,
-    ekf,
-    grid,
-    init,
-    landmarks,
-    map_scans,
-    motion,
-    run,
-    stages,
-    step,
-)
+from jaxlocmap import Config, Gaussian, GridSpec, Inputs, Params, init, map_scans, motion, run, sensors, step
+from jaxlocmap.filters import ekf
+from jaxlocmap.mapping import grid
 
 GATE = ekf.gate_threshold(0.99, 2)
 STEPS = 12  # of a short run: the course's detector looks at steps 0, 5 and 10
@@ -477,7 +464,7 @@ def test_every_atom_keeps_float32(single):
     @jax.jit
     def every_atom(params, prior, inputs, mark, beam_angles):
         (mean, cov), z, control, dt = prior, inputs.z[0], inputs.control, inputs.dt
-        residual, H, _ = landmarks.linearise(mean, mark, z, offset)
+        residual, H, _ = sensors.linearise(mean, mark, z, offset)
         empty = jnp.zeros(spec.shape, jnp.float32)
         log_odds = grid.update_log_odds(
             empty, mean, inputs.ranges, beam_angles, params.l_occ, params.l_free, spec=spec, **reach
@@ -487,7 +474,7 @@ def test_every_atom_keeps_float32(single):
             "transition": [model.transition(mean, control, dt) for model in motion.MODELS.values()],
             "predict": ekf.predict(mean, cov, control, dt, params.Q, motion=motion.ARC, nominal_dt=0.1),
             "update": ekf.update(mean, cov, residual, H, params.R, threshold=GATE),
-            "sensor": [residual, H.array(jnp.float32), landmarks.observe(mean, mark, offset)],
+            "sensor": [residual, H.array(jnp.float32), sensors.observe(mean, mark, offset)],
             "wheels": [motion.from_wheels(dt, z[0], 0.4), motion.to_wheels(control, 0.4)],
             "map": [log_odds, grid.probability(log_odds), grid.entropy_bits(log_odds)],
             "brier": grid.brier(log_odds, occupied, occupied),
@@ -639,7 +626,7 @@ def test_what_is_not_said_of_a_step_is_taken_for_its_own_reason(course):
     """Standing still for the time that passed, or moving not at all for a nominal time; told, either way."""
     belief = Gaussian(jnp.array([1.0, 2.0, 0.5]), jnp.eye(3) * 1e-4)
     go, config = jnp.array([0.7, 0.3]), course.config()
-    predict = jax.jit(functools.partial(stages.predict, config=config))
+    predict = jax.jit(functools.partial(step.predict, config=config))
     for control, dt, taken, usable in (
         (go, 0.0, (go, 0.0), True),
         (go, 0.4, (go, 0.4), True),
@@ -661,31 +648,31 @@ def test_what_is_not_said_of_a_step_is_taken_for_its_own_reason(course):
 )
 def test_a_belief_is_sound_if_all_of_it_is(place, bad):
     mean, cov = jnp.array([1.0, 2.0, 0.5]), jnp.eye(3)
-    assert stages.sound(Gaussian(mean, cov))
-    assert not stages.sound(Gaussian(mean.at[place].set(bad), cov))
-    assert not stages.sound(Gaussian(mean, cov.at[place, place].set(bad)))
-    assert not stages.sound(Gaussian(mean, cov.at[place, place].set(-1.0)))
+    assert step.sound(Gaussian(mean, cov))
+    assert not step.sound(Gaussian(mean.at[place].set(bad), cov))
+    assert not step.sound(Gaussian(mean, cov.at[place, place].set(bad)))
+    assert not step.sound(Gaussian(mean, cov.at[place, place].set(-1.0)))
 
 
 def test_a_place_is_held_below_16384_m_in_float32_on_either_side_of_either_axis():
     far, near = 16_384, 16_384 - 2**-10
     places = [[near, 0], [far, 0], [-near, 0], [-far, 0], [0, far], [0, -far], [near, -near]]
     x, y = jnp.array(places, jnp.float32).T
-    np.testing.assert_array_equal(stages.is_held(x, y), [True, False, True, False, False, False, True])
-    assert not stages.is_held(jnp.array(jnp.nan), jnp.array(0.0))
+    np.testing.assert_array_equal(step.is_held(x, y), [True, False, True, False, False, False, True])
+    assert not step.is_held(jnp.array(jnp.nan), jnp.array(0.0))
 
 
 def test_a_range_is_one_above_zero_and_a_bearing_any_number():
     reach = jnp.array([1e-9, 0.0, -0.0, -1.0, jnp.nan, jnp.inf, 1.0, 1.0, 1.0, 1.0])
     bearing = jnp.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.0, jnp.nan, jnp.inf, -jnp.inf])
     expected = [True, False, False, False, False, False, True, False, False, False]
-    np.testing.assert_array_equal(stages.is_measurement(reach, bearing), expected)
+    np.testing.assert_array_equal(step.is_measurement(reach, bearing), expected)
 
 
 @pytest.mark.parametrize("softness", [0.0, 1.0])
 def test_an_observation_whose_covariance_is_none_is_reported_and_not_called_used(softness, course):
     """R = -9 I makes that of the innovation negative."""
-    correct = jax.jit(functools.partial(stages.correct, config=course.config(gate_softness=softness)))
+    correct = jax.jit(functools.partial(step.correct, config=course.config(gate_softness=softness)))
     belief = Gaussian(jnp.array([1.0, 2.0, 0.0]), jnp.eye(3) * 1e-4)
     rest = jnp.array([1.01, 0.01]), jnp.array([2.0, 2.0]), jnp.array(3, jnp.int32), jnp.array(True)
     for R, fine in ((course.params.R, True), (-9 * jnp.eye(2), False)):
@@ -1031,11 +1018,11 @@ def test_what_a_step_is_made_of_refuses_a_batch_by_name(name, course):
     shapes = {"control": (2,), "dt": (), "z": (2,), "landmark": (2,), "row": (), "usable": (), "mean": (3,)}
     shapes["cov"] = (3, 3)
     parts = (
-        lambda of: stages.predict(course.params, of("mean", "cov"), of("control"), of("dt"), config=Config()),
-        lambda of: stages.correct(
+        lambda of: step.predict(course.params, of("mean", "cov"), of("control"), of("dt"), config=Config()),
+        lambda of: step.correct(
             course.params, of("mean", "cov"), of("z"), of("landmark"), of("row"), of("usable") > 0, config=Config()
         ),
-        lambda of: stages.sound(of("mean", "cov")),
+        lambda of: step.sound(of("mean", "cov")),
     )
     uses = ({"control", "dt", "mean", "cov"}, {"z", "landmark", "row", "usable", "mean", "cov"}, {"mean", "cov"})
     for wrong in ((5, *shapes[name]), (1,)):

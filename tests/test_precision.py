@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import reference
 
-from jaxlocmap import Gaussian, Inputs, Params, simulate
+from jaxlocmap import Gaussian, Inputs, Params, simulation
 from jaxlocmap.monte_carlo import monte_carlo
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import precision
 
 STEPS, RUNS = 80, 6
-SHORT = dataclasses.replace(simulate.LOOP, steps=STEPS)
+SHORT = dataclasses.replace(simulation.LOOP, steps=STEPS)
 CONFIG = SHORT.config(motion="euler", gate_probability=None, grid=False)
 
 
@@ -37,21 +37,21 @@ def outcome():
     """Every drive's own scores."""
     with jax.enable_x64(True):
         study = precision.Precision(SHORT, CONFIG)
-        noise = simulate.Noise()
-        arguments = (simulate.own_params(noise, SHORT.dt), simulate.room(), noise, SHORT.prior())
+        noise = simulation.Noise()
+        arguments = (simulation.own_params(noise, SHORT.dt), simulation.room(), noise, SHORT.prior())
         return monte_carlo(study, jax.random.key(0), RUNS, *arguments, keep_runs=True).value
 
 
 def test_the_filter_in_float64_is_the_reference(outcome):
     with jax.enable_x64(True):
-        prior, world, noise = SHORT.prior(), simulate.room(), simulate.Noise()
-        params = simulate.own_params(noise, SHORT.dt)
+        prior, world, noise = SHORT.prior(), simulation.room(), simulation.Noise()
+        params = simulation.own_params(noise, SHORT.dt)
 
         @jax.jit
         def drive(key):
             start_key, key = jax.random.split(key)
-            start = simulate.draw_pose(start_key, prior)
-            return simulate.simulate(key, world, noise, start, scenario=SHORT, scan=False)
+            start = simulation.draw_pose(start_key, prior)
+            return simulation.simulate(key, world, noise, start, scenario=SHORT, scan=False)
 
         scene = (*map(np.asarray, (world.landmarks, params.Q, params.R)), math.inf, reference.euler, SHORT.dt)
         for i in range(2):
@@ -174,7 +174,7 @@ def test_a_sharper_detector_is_sharper_in_truth_and_in_the_filter(outcome, monke
     row = precision._row(0, STEPS, RUNS, 10.0, None)
     _, _, runs, params, _, noise, _ = given[0]
     assert (runs, row["detector_sharper"]) == (RUNS, 10)
-    assert noise == simulate.Noise()._replace(range=0.008, bearing=0.002)
+    assert noise == simulation.Noise()._replace(range=0.008, bearing=0.002)
     np.testing.assert_allclose(params.R, np.diag([0.008, 0.002]) ** 2, rtol=1e-5)
     np.testing.assert_allclose(params.Q, np.diag([0.02**2, 0.01**2 + (0.005 / 0.1) ** 2]), rtol=1e-5)
 

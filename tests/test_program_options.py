@@ -14,7 +14,7 @@ import pytest
 import reference
 from programs import Enough, Recorder, stop
 
-from jaxlocmap import Gaussian, Params, simulate
+from jaxlocmap import Gaussian, Params, simulation
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import capstone
@@ -94,9 +94,9 @@ def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
         "seed": config.seed,
     } == expected | fields
     assert same_key(key, config.seed)
-    np.testing.assert_array_equal(params.R, simulate.course_params().R)
-    np.testing.assert_array_equal(world.landmarks, simulate.room().landmarks)
-    assert noise == simulate.Noise()
+    np.testing.assert_array_equal(params.R, simulation.course_params().R)
+    np.testing.assert_array_equal(world.landmarks, simulation.room().landmarks)
+    assert noise == simulation.Noise()
     np.testing.assert_allclose(prior.mean, study.scenario.start, rtol=1e-6)
     assert named == {name: getattr(config, name) for name in CONSISTENCY}
 
@@ -165,7 +165,7 @@ def written_by_process_0_alone(monkeypatch, program, config):
 def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     ran = Recorder(SimpleNamespace(value="reference"))
     monkeypatch.setattr(consistency, "monte_carlo", ran)
-    scenario = simulate.CAPSTONE
+    scenario = simulation.CAPSTONE
     settings = scenario.config(motion="arc", gate_probability=0.9, grid=True)
     config = consistency.ConsistencyConfig(seed=3, gate=0.9, compute=common.ComputeConfig(devices=1))
     assert consistency._reference(scenario, settings, config, runs) == "reference"
@@ -176,14 +176,14 @@ def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(expected))
     assert (study.scenario, study.config.motion, study.config.grid) == (scenario, "euler", None)
     assert study.config.gate_probability == 0.9
-    np.testing.assert_array_equal(params.R, simulate.own_params(simulate.Noise(), scenario.dt).R)
+    np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), scenario.dt).R)
     assert how["devices"] == jax.local_devices()[:1]
 
 
 @pytest.mark.parametrize(("exact", "gate", "needed"), [(True, None, True), (False, 0.9, True), (False, None, False)])
 def test_a_reference_is_run_where_start_or_gate_make_something_of_a_filter(monkeypatch, exact, gate, needed):
     monkeypatch.setattr(consistency, "monte_carlo", Recorder(SimpleNamespace(value="reference")))
-    scenario = dataclasses.replace(simulate.LOOP, exact_prior=exact)
+    scenario = dataclasses.replace(simulation.LOOP, exact_prior=exact)
     settings = scenario.config(gate_probability=gate)
     config = consistency.ConsistencyConfig(gate=gate)
     assert (consistency._reference(scenario, settings, config, 10) is not None) == needed
@@ -194,7 +194,7 @@ class Mapped(NamedTuple):
 
 
 def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
-    scenario = dataclasses.replace(simulate.LOOP, steps=4)
+    scenario = dataclasses.replace(simulation.LOOP, steps=4)
     settings = scenario.config(motion="euler", gate_probability=0.9)
     drove = Recorder((SimpleNamespace(pose=np.full((4, 3), 2.0)), {"inputs": np.ones(4)}))
     monkeypatch.setattr(consistency.simulate, "simulate", drove)
@@ -202,10 +202,10 @@ def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     monkeypatch.setattr(consistency, "run", lambda params, state, inputs, **how: ran(params.R[0, 0], inputs, **how))
     monkeypatch.setattr(consistency.plotting, "map_figure", figure := Recorder())
     key = jax.random.key(6)
-    consistency._picture_of_one_run(tmp_path / "a.png", key, simulate.course_params(), scenario, settings)
+    consistency._picture_of_one_run(tmp_path / "a.png", key, simulation.course_params(), scenario, settings)
     ((given, world, noise, start), how) = drove.calls[0]
     assert same_key(given, 6)
-    assert (noise, how) == (simulate.Noise(), {"scenario": scenario})
+    assert (noise, how) == (simulation.Noise(), {"scenario": scenario})
     np.testing.assert_allclose(start, scenario.start, rtol=1e-6)
     ((_, inputs), how) = ran.calls[0]
     assert (set(inputs), how["config"], how["collect"]) == ({"inputs"}, settings, consistency._poses)
@@ -293,7 +293,7 @@ def test_options_of_a_sweep(monkeypatch, tmp_path, options, fields):
 def test_values_of_a_sweep(monkeypatch, tmp_path, plant):
     _, _, _, x, y, params, *_ = swept(monkeypatch, tmp_path, x_values=(1.0, 2.0), y_values=(3.0, 4.0, 5.0))
     assert (x.tolist(), y.tolist()) == ([1, 2], [3, 4, 5])
-    np.testing.assert_array_equal(params.R, simulate.own_params(simulate.Noise(), simulate.LOOP.dt).R)
+    np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), simulation.LOOP.dt).R)
     _, _, _, x, y, params, *_ = swept(monkeypatch, tmp_path, y="gate_probability", quick=True, params=plant[0])
     np.testing.assert_allclose(x, 8.0 ** np.linspace(-1, 1, 5), rtol=1e-6)
     np.testing.assert_allclose(y, (0.5, 0.9, 0.99, 0.9999, 1.0), rtol=1e-6)
@@ -381,7 +381,7 @@ def test_what_a_sweep_shows(monkeypatch, across):
 
 def test_the_course_draws_are_those_of_its_seed():
     """In the order of its program, in which a step's heading comes before its speed and yaw rate."""
-    scenario = dataclasses.replace(simulate.CAPSTONE, steps=12)
+    scenario = dataclasses.replace(simulation.CAPSTONE, steps=12)
     drawn = reference.course_draws(seed=9, steps=12)
     draws = capstone.course_draws(9, scenario, 4)
     drive, sighting, scan = (np.asarray(x) for x in draws)
@@ -394,7 +394,7 @@ def test_the_course_draws_are_those_of_its_seed():
 @pytest.mark.parametrize("seed", [-1, 2**32])
 def test_a_seed_that_numpy_has_not(seed):
     with pytest.raises(ValueError, match=f"seed: expected 0 to .* got {seed}"):
-        capstone.course_draws(seed, simulate.CAPSTONE, 4)
+        capstone.course_draws(seed, simulation.CAPSTONE, 4)
 
 
 def test_the_detector_of_the_course_goes_by_what_it_measures(monkeypatch):
@@ -402,10 +402,10 @@ def test_the_detector_of_the_course_goes_by_what_it_measures(monkeypatch):
     rolled.answer[1].z = np.array([[[7.4, 0.0], [7.5, 0.0]], [[1.0, 0.0], [2.0, 9.0]]])
     monkeypatch.setattr(capstone, "course_draws", draws := Recorder("draws"))
     monkeypatch.setattr(capstone.simulate, "roll_out", rolled)
-    world = simulate.room()
-    truth, inputs = capstone.course_drive(17, simulate.CAPSTONE, world)
+    world = simulation.room()
+    truth, inputs = capstone.course_drive(17, simulation.CAPSTONE, world)
     assert (truth, inputs["valid"].tolist()) == ("truth", [[True, False], [False, True]])
-    assert draws.calls[0][0] == (17, simulate.CAPSTONE, 4)
+    assert draws.calls[0][0] == (17, simulation.CAPSTONE, 4)
     assert rolled.calls[0][1]["scenario"].sight_range == math.inf
 
 
@@ -416,7 +416,7 @@ def course_report(monkeypatch, tmp_path):
     off = np.array([[0.3, 0.4, 0], [0, 0, 0.2], [0, 0, 0.1 - 2 * math.pi], [0, 0.5, 0]])
     belief = Gaussian(truth - off, np.array([np.diag([0.25, 0.25, 0.01])] * 4))
     scenario = dataclasses.replace(
-        simulate.CAPSTONE, steps=4, grid=dataclasses.replace(simulate.CAPSTONE.grid, shape=(2, 3))
+        simulation.CAPSTONE, steps=4, grid=dataclasses.replace(simulation.CAPSTONE.grid, shape=(2, 3))
     )
     monkeypatch.setattr(capstone.simulate, "CAPSTONE", scenario)
     log_odds = np.array([[0.0, 2.0, -1.0], [0.0, 0.0, 3.0]])
@@ -460,7 +460,7 @@ def test_numbers_of_the_course_s_run(course_report):
     np.testing.assert_array_equal(estimate, belief.mean)
     np.testing.assert_array_equal(cov, belief.cov)
     np.testing.assert_array_equal(true, truth)
-    np.testing.assert_array_equal(how["landmarks"], simulate.room().landmarks)
+    np.testing.assert_array_equal(how["landmarks"], simulation.room().landmarks)
     ((_, odds, grid, path), how) = figures["map_figure"].calls[0]
     np.testing.assert_array_equal(odds, log_odds)
     np.testing.assert_array_equal(path, belief.mean)
@@ -620,7 +620,7 @@ def test_studies_are_counted_by_their_verdicts(monkeypatch, exact, gate, beside)
     monkeypatch.setattr(verdicts, "summarise", summarise)
     monkeypatch.setattr(verdicts, "_factor_intervals", Recorder("factors"))
     monkeypatch.setattr(verdicts, "_intervals", Recorder("intervals"))
-    scenario = dataclasses.replace(simulate.LOOP, exact_prior=exact)
+    scenario = dataclasses.replace(simulation.LOOP, exact_prior=exact)
     row = verdicts._studies(jax.random.key(0), scenario, gate, 4, runs)
     assert row["setting"] == f"loop, {'exact' if exact else 'drawn'}" + (", gate" if gate else "")
     assert row["anees"] == pytest.approx(3 * 2.5 / runs)
@@ -687,9 +687,9 @@ def test_single_runs_are_judged_one_by_one(monkeypatch):
     runs, samples = [], iter((10.0, 50.0, 33.0))
 
     def monte_carlo(single, key, count, params, world, noise, prior, keep_runs):
-        assert (count, keep_runs, single.scenario) == (1, True, simulate.LOOP)
+        assert (count, keep_runs, single.scenario) == (1, True, simulation.LOOP)
         runs.append(tuple(np.asarray(jax.random.key_data(key)).tolist()))
-        np.testing.assert_array_equal(params.R, simulate.own_params(noise, 0.1).R)
+        np.testing.assert_array_equal(params.R, simulation.own_params(noise, 0.1).R)
         return SimpleNamespace(value=(np.ones((1, 5, 3)), Gaussian(np.zeros((1, 5, 3)), np.zeros((1, 5, 3, 3)))))
 
     def judge(truth, mean, cov):
@@ -700,7 +700,7 @@ def test_single_runs_are_judged_one_by_one(monkeypatch):
 
     monkeypatch.setattr(verdicts, "monte_carlo", monte_carlo)
     monkeypatch.setattr(verdicts.consistency, "judge", judge)
-    row = verdicts._single_runs(jax.random.key(0), simulate.LOOP, 3)
+    row = verdicts._single_runs(jax.random.key(0), simulation.LOOP, 3)
     assert len(set(runs)) == 3
     assert row == {
         "scenario": "loop",

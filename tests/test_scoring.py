@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import Gaussian, scoring
-from jaxlocmap.stages import Sighting
+from jaxlocmap import Gaussian
+from jaxlocmap.consistency import scoring
+from jaxlocmap.step import Sighting
 
 scored = jax.jit(scoring.score_step)
 sighted = jax.jit(scoring.score_sighting)

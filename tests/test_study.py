@@ -14,12 +14,13 @@ import reference
 import scipy.stats
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxlocmap import GridSpec, Params, batching, init, run, simulate
+from jaxlocmap import GridSpec, Params, init, run, simulation
+from jaxlocmap._internal import batching
 from jaxlocmap.consistency import COVERAGE_LEVELS
+from jaxlocmap.consistency.scoring import NEES_EDGES, PHASES, Averages, Undiverged
+from jaxlocmap.consistency.study import MapTotals, Study, Totals, median_nees, pose_means, reference_study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.scoring import NEES_EDGES, PHASES, Averages, Undiverged
-from jaxlocmap.simulate import CAPSTONE, LOOP, Noise
-from jaxlocmap.study import MapTotals, Study, Totals, median_nees, pose_means, reference_study, summarise
+from jaxlocmap.simulation import CAPSTONE, LOOP, Noise
 
 # What the plant really does, seen by a first-order filter: the heading noise of a step is a yaw rate's as well.
 PLANT = {"v": 0.02, "w": math.hypot(0.01, 0.005 / 0.1), "range": 0.08, "bearing": 0.02}
@@ -52,7 +53,7 @@ def copies(count, *trees):
 
 def by_run(scenario, config, params, runs, *, world=None):
     """Every run's own totals."""
-    world, prior = simulate.room() if world is None else world, scenario.prior()
+    world, prior = simulation.room() if world is None else world, scenario.prior()
     arguments = (jax.random.key(0), runs, params, world, Noise(), prior)
     return monte_carlo(Study(scenario, config), *arguments, chunk=250, keep_runs=True).value
 
@@ -131,7 +132,7 @@ def test_the_bands_of_a_study_are_the_spread_between_its_runs(honest):
 
 def test_a_drawn_prior_is_honest_before_anything_is_observed(honest):
     del honest  # which has compiled this
-    world = simulate.room()
+    world = simulation.room()
     runs = by_run(HONEST, HONEST_CONFIG, Params.from_std(**PLANT), 250, world=out_of_sight(world))
     assert runs.observed.sum() == 0
     # The runs' NEES of the first step are independent χ² with 3 degrees.
@@ -157,7 +158,7 @@ def test_a_covariance_wrong_by_a_factor_is_reported_with_that_factor(honest, sca
 
 
 def course(runs, params):
-    return keys_of(runs), *jax.tree.map(jnp.array, copies(runs, params, simulate.room(), Noise(), CAPSTONE.prior()))
+    return keys_of(runs), *jax.tree.map(jnp.array, copies(runs, params, simulation.room(), Noise(), CAPSTONE.prior()))
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +167,7 @@ def capstones():
     results = {}
     for motion, name in (("capstone", "course"), ("euler", "course"), ("euler", "plant")):
         config = CAPSTONE.config(motion=motion, grid=False)
-        params = simulate.course_params() if name == "course" else Params.from_std(**PLANT)
+        params = simulation.course_params() if name == "course" else Params.from_std(**PLANT)
         runs = jax.tree.map(np.asarray, studied(*course(1000, params), scenario=CAPSTONE, config=config))
         results[motion, name] = runs, summarise(sums(runs), config)
     return results
@@ -231,7 +232,9 @@ lied = functools.partial(studied, scenario=LIED, config=LIED_CONFIG)
 
 def batch(faults):
     """What every run is given: the same but for its fault."""
-    params, world, noise, prior = copies(len(faults), simulate.course_params(), simulate.room(), Noise(), SHORT.prior())
+    params, world, noise, prior = copies(
+        len(faults), simulation.course_params(), simulation.room(), Noise(), SHORT.prior()
+    )
     no_number = {"control": noise.v, "Q": params.Q, "R": params.R}
     no_number |= {name: getattr(noise, name) for name in ("bearing", "range", "heading", "scan")}
     for i, fault in enumerate(faults):
@@ -253,12 +256,12 @@ def played(*args, scenario, config):
 
     def one(key, params, world, noise, prior):
         start_key, key = jax.random.split(key)
-        start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
+        start = prior.mean if scenario.exact_prior else simulation.draw_pose(start_key, prior)
         mapping = config.grid is not None
-        truth, inputs = simulate.simulate(key, world, noise, start, scenario=scenario, scan=mapping)
+        truth, inputs = simulation.simulate(key, world, noise, start, scenario=scenario, scan=mapping)
         scene = {"landmarks": world.landmarks, "beam_angles": scenario.beam_angles(), "config": config}
         state, info = run(params, init(prior, config=config), inputs, **scene)
-        true_map = simulate.occupancy(world, config.grid) if mapping else None
+        true_map = simulation.occupancy(world, config.grid) if mapping else None
         return truth.pose, inputs, info, state.log_odds, true_map
 
     return jax.vmap(one)(*args)
@@ -392,7 +395,7 @@ def faulty():
 def lies(gates=(0.9, 0.9, 1.0, 1.0), outlier_rate=0.3):
     """What every run of the study with outliers is given, and its gate."""
     params, noise = Params.from_std(**PLANT), Noise(outlier_rate=outlier_rate)
-    args = copies(len(gates), params, simulate.room(), noise, LIED.prior())
+    args = copies(len(gates), params, simulation.room(), noise, LIED.prior())
     keys = jax.random.split(jax.random.key(1), len(gates))
     return keys, *jax.tree.map(jnp.array, args), jnp.array(gates)
 
@@ -419,7 +422,7 @@ def test_added_up_step_by_step_a_study_is_the_sum_of_its_runs(faulty, tolerance)
 
 def test_runs_of_the_whole_loop_are_simulate_run_and_numpy(honest, tolerance):
     """From a start drawn from the prior, without gate and map; two laps."""
-    args = jax.tree.map(jnp.array, copies(3, Params.from_std(**PLANT), simulate.room(), Noise(), HONEST.prior()))
+    args = jax.tree.map(jnp.array, copies(3, Params.from_std(**PLANT), simulation.room(), Noise(), HONEST.prior()))
     for i, expected in enumerate(by_hand((keys_of(3), *args), HONEST, HONEST_CONFIG)):
         assert_same(of_run(honest[1.0][0], i), expected, tolerance(1e-10, 2e-2), tolerance(1e-11, 1e-3), i)
 
@@ -427,7 +430,7 @@ def test_runs_of_the_whole_loop_are_simulate_run_and_numpy(honest, tolerance):
 def test_runs_of_the_whole_course_are_simulate_run_and_numpy(capstones, tolerance):
     """Behind a gate, without a map."""
     config, runs = CAPSTONE.config(motion="capstone", grid=False), capstones["capstone", "course"][0]
-    for i, expected in enumerate(by_hand(course(3, simulate.course_params()), CAPSTONE, config)):
+    for i, expected in enumerate(by_hand(course(3, simulation.course_params()), CAPSTONE, config)):
         assert_same(of_run(runs, i), expected, tolerance(1e-10, 2e-2), tolerance(1e-11, 1e-3), i)
 
 
@@ -480,7 +483,7 @@ def test_the_totals_of_a_run_are_the_reference_s(faulty, tolerance):
     how = {**reference.COURSE_SCAN, "resolution": SHORT.grid.resolution}
     for pose, ranges in zip(report["mean"], inputs.ranges, strict=True):
         log_odds = reference.update_scan(log_odds, pose, ranges, np.asarray(SHORT.beam_angles()), **how)
-    occupied = np.asarray(jax.jit(simulate.occupancy, static_argnums=1)(simulate.room(), SHORT.grid))
+    occupied = np.asarray(jax.jit(simulation.occupancy, static_argnums=1)(simulation.room(), SHORT.grid))
     ok = np.ones(SHORT.steps, bool)
     expected = score(truth, inputs.valid, 0.99, ok, map_score(log_odds, occupied), **report)
     assert expected.observed.sum() == 4 * SHORT.steps / SHORT.sight_period
@@ -524,7 +527,7 @@ def test_a_run_alone_is_the_run_in_company(faulty, tolerance):
 def test_the_slope_of_a_total_is_a_finite_difference(x64):
     del x64
     # Ten crossings by the course's -0.4 end exactly at a clamp, where there are two slopes.
-    params = simulate.course_params()._replace(l_free=jnp.array(-0.37))
+    params = simulation.course_params()._replace(l_free=jnp.array(-0.37))
     _, slope = alone("none", params)
     leaves, structure = jax.tree.flatten(params)
     rng = np.random.default_rng(0)
@@ -665,7 +668,7 @@ def test_runs_that_are_a_metre_off_and_exclude_it_at_any_step_are_lost():
 def test_a_run_that_is_far_off_and_says_so_is_not_lost():
     """Dead reckoning by a speedometer that is 30 m/s off, and known to be."""
     count = len(FAULTS)
-    params, world = Params.from_std(**PLANT | {"v": 30.0}), out_of_sight(simulate.room())
+    params, world = Params.from_std(**PLANT | {"v": 30.0}), out_of_sight(simulation.room())
     args = jax.tree.map(jnp.array, copies(count, params, world, Noise(v=30.0), SHORT.prior()))
     totals = [sums(short(jax.random.split(jax.random.key(seed), count), *args)) for seed in range(5)]
     report = summarise(sums(jax.tree.map(lambda *x: np.stack(x), *totals)), SHORT_CONFIG)
@@ -893,7 +896,7 @@ def test_a_filter_that_is_told_the_truth_differs_in_nothing_else():
     noise = Noise(heading=0.01, v=0.03, w=0.02, range=0.1, bearing=0.05)
     study, params = reference_study(SHORT, config, noise)
     assert study == Study(SHORT, dataclasses.replace(config, motion="euler", grid=None))
-    jax.tree.map(np.testing.assert_array_equal, params, simulate.own_params(noise, SHORT.dt))
+    jax.tree.map(np.testing.assert_array_equal, params, simulation.own_params(noise, SHORT.dt))
 
 
 def test_what_such_a_filter_shows_is_in_the_report():
@@ -922,7 +925,7 @@ def test_the_median_of_the_runs_average_nees_is_numpy_s_to_a_bin():
 
 def test_a_study_of_a_sensor_that_sits_elsewhere_is_refused():
     study = Study(SHORT, dataclasses.replace(SHORT_CONFIG, sensor_offset=(0.1, 0.0, 0.0)))
-    args = simulate.course_params(), simulate.room(), Noise(), SHORT.prior()
+    args = simulation.course_params(), simulation.room(), Noise(), SHORT.prior()
     with pytest.raises(ValueError, match=r"config\.sensor_offset: expected that of the scenario, \(0\.0, 0\.0, 0\.0\)"):
         study(jax.random.key(0), *args)
 
@@ -930,6 +933,6 @@ def test_a_study_of_a_sensor_that_sits_elsewhere_is_refused():
 def test_the_priors_dtype_wins_over_that_of_everything_else(x64):
     """As in `pipeline.run`."""
     prior = jax.tree.map(lambda x: x.astype(jnp.float32), SHORT.prior())
-    args = (simulate.course_params(), simulate.room(), Noise(), prior)
+    args = (simulation.course_params(), simulation.room(), Noise(), prior)
     shapes = jax.eval_shape(Study(SHORT, SHORT_CONFIG), jax.random.key(0), *args)
     assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {np.dtype(np.float32)}

@@ -12,16 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxlocmap import Params, plotting, simulate
+from jaxlocmap import Params, plotting, simulation
+from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.study import Study, summarise
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import sweep
 
 # In sight of all four landmarks, which the detector looks for in every second step; it can be lied to.
 SHORT = dataclasses.replace(
-    simulate.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12, sight_period=2, outliers=True
+    simulation.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12, sight_period=2, outliers=True
 )
 RUNS, RATES, GATES = 16, (0.0, 0.3, 0.6), (0.9, 1.0)
 Q, R = np.diag([0.02**2, 0.051**2]), np.diag([0.08**2, 0.02**2])
@@ -52,7 +52,7 @@ class Stub:
 
 def handed(x, y, x_values, y_values, params):
     study = sweep.SweepStudy(Stub(), x, y)
-    return study(None, jnp.array(x_values), jnp.array(y_values), params, None, simulate.Noise(), None)
+    return study(None, jnp.array(x_values), jnp.array(y_values), params, None, simulation.Noise(), None)
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +98,8 @@ def settings():
 
 
 def shared():
-    noise = simulate.Noise()
-    return simulate.own_params(noise, SHORT.dt), simulate.room(), noise, SHORT.prior()
+    noise = simulation.Noise()
+    return simulation.own_params(noise, SHORT.dt), simulation.room(), noise, SHORT.prior()
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +115,7 @@ def program(grid, tmp_path_factory):
     """Two sweeps by the program, over other values each, after one that has compiled it."""
     del grid
     patch = pytest.MonkeyPatch()
-    patch.setitem(simulate.SCENARIOS, "short", SHORT)
+    patch.setitem(simulation.SCENARIOS, "short", SHORT)
     reports = []
     for rates, gates in (((0.0, 0.2, 0.8), (0.5, 1.0)), (RATES, GATES)):
         out = tmp_path_factory.mktemp("sweep")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxlocmap.trig import arctan2, sin_cos
+from jaxlocmap._internal.trig import arctan2, sin_cos
 
 CLOSE = 1.5 * 2.0**-24  # a number below one is rounded by up to 2**-25
 

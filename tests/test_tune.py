@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from test_experiments import is_png
 
-from jaxlocmap import Config, Params, simulate, tuning
+from jaxlocmap import Config, Params, simulation, tuning
 from jaxlocmap.tuning.fit import Trace
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
@@ -57,7 +57,7 @@ def test_simulated_drives(tmp_path):
 
 def test_ctrl_c_while_judging_stops_at_once_and_says_what_is_kept(monkeypatch, tmp_path):
     trace = Trace(*np.zeros((4, 4)), params={"range": np.ones(4)})
-    found = tuning.Fit(simulate.own_params(simulate.Noise(), 0.1), 1.0, np.ones(3), trace, 0, False, 0.0, 0.0)
+    found = tuning.Fit(simulation.own_params(simulation.Noise(), 0.1), 1.0, np.ones(3), trace, 0, False, 0.0, 0.0)
     source = tune.Source("made", found.params, Config(dt=0.1), *[None] * 3, None, 0.1)
     monkeypatch.setattr(tune, "_source", lambda *_: source)
 

@@ -12,9 +12,9 @@ import pytest
 from programs import Recorder
 from test_localize import made_log
 
-from jaxlocmap import Config, Gaussian, Params, simulate, tuning
-from jaxlocmap.foresight import Foresight
+from jaxlocmap import Config, Gaussian, Params, simulation, tuning
 from jaxlocmap.logs import Log
+from jaxlocmap.mapping.predictive import Foresight
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import tune
@@ -63,17 +63,17 @@ def test_a_scenario_is_tuned_validated_and_judged_on_drives_of_their_own(scene):
     assert [args[1] for args, _ in scene.simulated.calls] == [40, 10]
     assert key_data(train[0][0]) != key_data(validation[0][0])
     for args, _ in scene.simulated.calls:
-        np.testing.assert_array_equal(args[2].segments, simulate.room().segments)
-        assert args[3] == simulate.Noise()
-    assert train[1] == validation[1] == {"scenario": simulate.LOOP, "scans": False, "worlds": False}
+        np.testing.assert_array_equal(args[2].segments, simulation.room().segments)
+        assert args[3] == simulation.Noise()
+    assert train[1] == validation[1] == {"scenario": simulation.LOOP, "scans": False, "worlds": False}
     assert (source.name, source.dt) == ("loop, euler motion, 40 runs", 0.1)
     assert (source.train, source.compared, source.validation) == ("batch of 40", "batch of 40", "batch of 10")
     config = source.config
     assert (config.motion, config.gate_probability, config.gate_softness, config.grid) == ("euler", 0.999, 2.0, None)
-    np.testing.assert_array_equal(source.start.R, simulate.course_params().R)
+    np.testing.assert_array_equal(source.start.R, simulation.course_params().R)
     assert source.evidence(START) == {"anees": 3.0}
     ((study, key, runs, params, *_), _) = scene.monte_carlo.calls[0]
-    assert (study.scenario, study.config.motion, study.config.gate_probability) == (simulate.LOOP, "euler", 0.9)
+    assert (study.scenario, study.config.motion, study.config.gate_probability) == (simulation.LOOP, "euler", 0.9)
     assert (runs, study.config.gate_softness, study.config.grid) == (70, 0, None)
     assert (params.R.dtype, scene.summarise.calls) == (np.float32, [(("totals", study.config), {})])
     np.testing.assert_allclose(params.R, START.R, rtol=1e-6)
@@ -91,13 +91,13 @@ def test_a_map_is_tuned_and_judged_in_rooms_of_their_own(scene, monkeypatch):
     assert all(how["scans"] and how["worlds"] for _, how in scene.simulated.calls)
     rooms = [np.asarray(args[2]) for args, _ in scene.simulated.calls]
     assert len({room.tobytes() for batch in rooms for room in batch}) == 69
-    assert source.config.grid == simulate.CAPSTONE.grid
-    own, course = simulate.own_params(simulate.Noise(), 0.1), simulate.course_params()
+    assert source.config.grid == simulation.CAPSTONE.grid
+    own, course = simulation.own_params(simulation.Noise(), 0.1), simulation.course_params()
     np.testing.assert_array_equal(source.start.R, own.R)  # a robot that knows its own noise
     assert (source.start.l_occ, source.start.l_free) == (course.l_occ, course.l_free)
     assert source.evidence(START) == {"anees": 3.0, "one_scan_ahead": {"log_loss": 0.5}}
     ((study, _, runs, *_), _) = scene.monte_carlo.calls[0]
-    assert (runs, study.config.grid) == (200, simulate.CAPSTONE.grid)
+    assert (runs, study.config.grid) == (200, simulation.CAPSTONE.grid)
     assert scene.foresight.calls == [((START, "batch of 64", study.config), {})]
     both = tune_sources.from_scenario("capstone", "arc", 4, 10, wanted("map", "pose"))
     np.testing.assert_array_equal(both.start.R, course.R)
@@ -277,7 +277,7 @@ def test_scans_are_tuned_on_the_first_half_and_judged_on_the_second(monkeypatch,
     assert (source.config.max_range, source.config.grid.resolution) == (8.0, 0.5)
     np.testing.assert_allclose(source.train.inputs.ranges[0, 3], [1.03, 2.03, 8.0], rtol=1e-6)
     np.testing.assert_array_equal(source.train.beam_angles, [-0.5, 0, 0.5])
-    np.testing.assert_array_equal(source.start.R, simulate.course_params().R)
+    np.testing.assert_array_equal(source.start.R, simulation.course_params().R)
     assert source.evidence(START) == {"one_scan_ahead": "evidence"}
     ((params, later, config), _) = foresight.calls[0]
     assert (params, config) == (START, source.config)

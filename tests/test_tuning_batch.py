@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from drives import ONLY_POSES, OWN, SHORT, drives
 
-from jaxlocmap import Gaussian, Inputs, simulate, tuning
-from jaxlocmap.world import random_room
+from jaxlocmap import Gaussian, Inputs, simulation, tuning
+from jaxlocmap.simulation.world import random_room
 
 OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation", 1.0), ("pose", 1.0)))
 
@@ -254,7 +254,7 @@ def test_simulated_drives_hang_on_all_of_their_key_and_each_on_its_own():
 
     def made(*words):
         key = jax.random.wrap_key_data(jnp.array(words, jnp.uint32))
-        return tuning.simulated(key, 4, simulate.room(), simulate.Noise(), scenario=SHORT, scans=True)
+        return tuning.simulated(key, 4, simulation.room(), simulation.Noise(), scenario=SHORT, scans=True)
 
     batches = [made(0, 0), made(0, 1), made(1, 0)]
     ends = np.concatenate([np.asarray(batch.truth)[:, -1] for batch in batches])
@@ -265,7 +265,7 @@ def test_simulated_drives_hang_on_all_of_their_key_and_each_on_its_own():
     np.testing.assert_allclose(one.prior.mean, [SHORT.start] * 4, rtol=1e-6)
     np.testing.assert_allclose(one.prior.cov, [np.diag(np.square(SHORT.prior_std))] * 4, rtol=1e-5)
     np.testing.assert_allclose(one.beam_angles, np.linspace(-SHORT.half_view, SHORT.half_view, 9), rtol=1e-5)
-    np.testing.assert_array_equal(one.landmarks, simulate.room().landmarks)
+    np.testing.assert_array_equal(one.landmarks, simulation.room().landmarks)
     # From an exact start a step of a tenth of a second leads not far.
     assert np.abs(np.asarray(one.truth)[:, 0] - np.array(SHORT.start)).max() < 0.3
 
@@ -273,8 +273,10 @@ def test_simulated_drives_hang_on_all_of_their_key_and_each_on_its_own():
 def test_a_start_that_is_not_exact_is_drawn_from_the_prior_with_half_of_the_run_s_key():
     """One step of no time to speak of; of the heading there is noise of its own."""
     still = dataclasses.replace(SHORT, name="still", steps=1, dt=1e-9, exact_prior=False)
-    batch = tuning.simulated(jax.random.key(5), 8, simulate.room(), simulate.Noise(), scenario=still)
-    draw = jax.jit(jax.vmap(lambda key, prior: simulate.draw_pose(jax.random.split(key)[0], prior), in_axes=(0, None)))
+    batch = tuning.simulated(jax.random.key(5), 8, simulation.room(), simulation.Noise(), scenario=still)
+    draw = jax.jit(
+        jax.vmap(lambda key, prior: simulation.draw_pose(jax.random.split(key)[0], prior), in_axes=(0, None))
+    )
     starts = draw(jax.random.split(jax.random.key(5), 8), still.prior())
     np.testing.assert_allclose(batch.truth[:, 0, :2], starts[:, :2], rtol=0, atol=1e-5)
     assert batch.beam_angles is None
@@ -283,7 +285,7 @@ def test_a_start_that_is_not_exact_is_drawn_from_the_prior_with_half_of_the_run_
 
 def test_simulated_rooms_may_differ_from_run_to_run():
     rooms = jax.vmap(random_room)(jax.random.split(jax.random.key(1), 3))
-    batch = tuning.simulated(jax.random.key(0), 3, rooms, simulate.Noise(), scenario=SHORT, scans=True, worlds=True)
+    batch = tuning.simulated(jax.random.key(0), 3, rooms, simulation.Noise(), scenario=SHORT, scans=True, worlds=True)
     assert batch.inputs.ranges.shape == (3, 12, 9)
     assert batch.landmarks.shape == (4, 2)
     segments = np.asarray(rooms.segments)

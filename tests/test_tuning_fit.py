@@ -12,10 +12,10 @@ import scipy.optimize
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives
 from jax.flatten_util import ravel_pytree
 
-from jaxlocmap import Gaussian, Params, simulate, tuning
+from jaxlocmap import Gaussian, Params, simulation, tuning
 
 OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation", 1.0),))
-START = simulate.course_params()
+START = simulation.course_params()
 
 
 def test_it_finds_the_robots_own_noise(x64):
@@ -24,8 +24,8 @@ def test_it_finds_the_robots_own_noise(x64):
     so short drives.
     """
     lying = dataclasses.replace(SHORT, name="lying", steps=40, outliers=True)
-    noise = simulate.Noise(outlier_rate=0.05)
-    batch = tuning.simulated(jax.random.key(4), 400, simulate.room(), noise, scenario=lying)
+    noise = simulation.Noise(outlier_rate=0.05)
+    batch = tuning.simulated(jax.random.key(4), 400, simulation.room(), noise, scenario=lying)
     soft = dataclasses.replace(ONLY_POSES, gate_softness=2.0)
     fit = tuning.fit(tuning.Objective(soft, (("innovation", 1.0),)), START, batch)
     found, own = ({k: float(x) for k, x in tuning.natural(params).items()} for params in (fit.params, OWN))

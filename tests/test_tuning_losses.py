@@ -11,8 +11,8 @@ import pytest
 import scipy.stats
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives
 
-from jaxlocmap import Params, simulate, tuning
-from jaxlocmap.foresight import Foresight
+from jaxlocmap import Params, simulation, tuning
+from jaxlocmap.mapping.predictive import Foresight
 from jaxlocmap.tuning import losses
 from jaxlocmap.tuning.filtering import check_batch, filtered
 from jaxlocmap.tuning.losses import LOSSES
@@ -172,7 +172,9 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     pass in and out; behind a gate that decides, it does not.
     """
     lying = dataclasses.replace(SHORT, name="lying", steps=60, outliers=True)
-    batch = tuning.simulated(jax.random.key(2), 64, simulate.room(), simulate.Noise(outlier_rate=0.1), scenario=lying)
+    batch = tuning.simulated(
+        jax.random.key(2), 64, simulation.room(), simulation.Noise(outlier_rate=0.1), scenario=lying
+    )
     own, h = tuning.unconstrain(OWN), 0.02
     places, weights = np.polynomial.legendre.leggauss(6)
     missed = {}

@@ -10,8 +10,9 @@ import pytest
 import reference
 import scipy.stats
 
-from jaxlocmap import GridSpec, world
-from jaxlocmap.world import World, room
+from jaxlocmap import GridSpec
+from jaxlocmap.simulation import world
+from jaxlocmap.simulation.world import World, room
 
 occupancy = jax.jit(world.occupancy, static_argnums=1)
 ray_cast = jax.jit(world.ray_cast)

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import jax
 
-from jaxlocmap import simulate
-from jaxlocmap.hosts import merge_kernels, use_all_cores
+from jaxlocmap import simulation
+from jaxlocmap.consistency.study import Study
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.study import Study
+from jaxlocmap.monte_carlo.hosts import merge_kernels, use_all_cores
 
 
 def peak_bytes() -> int:
@@ -38,10 +38,10 @@ def main() -> None:
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: arguments.cores])  # before JAX counts them
     merge_kernels()
     use_all_cores()
-    scenario = simulate.CAPSTONE
+    scenario = simulation.CAPSTONE
     study = Study(scenario, scenario.config(grid=arguments.map))
-    world, noise, prior = simulate.room(), simulate.Noise(), scenario.prior()
-    result = monte_carlo(study, jax.random.key(0), arguments.runs, simulate.course_params(), world, noise, prior)
+    world, noise, prior = simulation.room(), simulation.Noise(), scenario.prior()
+    result = monte_carlo(study, jax.random.key(0), arguments.runs, simulation.course_params(), world, noise, prior)
     print(json.dumps({"compile_s": result.compile_s, "run_s": result.run_s, "peak_bytes": peak_bytes()}))
 
 

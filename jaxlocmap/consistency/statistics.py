@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap.ekf import gate_threshold
-from jaxlocmap.linalg import Matrix, forward, ldl
+from jaxlocmap._internal.linalg import Matrix, forward, ldl
+from jaxlocmap.filters.ekf import gate_threshold
 from jaxlocmap.motion import wrap
 
 POSE_DIMENSION = 3

@@ -10,11 +10,11 @@ certainty.py   standard errors, correlations, and what the data cannot tell
 """
 
 from jaxlocmap.tuning.batch import Batch, blocks, join, no_observations, pick, sequence, simulated, windows
-from jaxlocmap.tuning.certainty import Certainty, certainty
 from jaxlocmap.tuning.filtering import beliefs
 from jaxlocmap.tuning.fit import Fit, coordinates_objective, fit
 from jaxlocmap.tuning.losses import LOSSES, Objective, foreseen
 from jaxlocmap.tuning.parameters import FULL_NOISE, NAMES, NOISE, SENSOR_MODEL, UNITS, constrain, natural, unconstrain
+from jaxlocmap.tuning.standard_errors import Certainty, certainty
 
 __all__ = [
     "FULL_NOISE",

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import simulate
+from jaxlocmap import simulation
+from jaxlocmap.simulation.world import World
 from jaxlocmap.types import Gaussian, Inputs
-from jaxlocmap.world import World
 
 
 class Batch(NamedTuple):
@@ -157,9 +157,9 @@ def simulated(
     key: jax.Array,
     runs: int,
     world: World,
-    noise: simulate.Noise,
+    noise: simulation.Noise,
     *,
-    scenario: simulate.Scenario,
+    scenario: simulation.Scenario,
     scans: bool = False,
     worlds: bool = False,
 ) -> Batch:
@@ -188,17 +188,17 @@ def simulated(
 def _drives(
     keys: jax.Array,
     world: World,
-    noise: simulate.Noise,
+    noise: simulation.Noise,
     prior: Gaussian,
     *,
-    scenario: simulate.Scenario,
+    scenario: simulation.Scenario,
     scans: bool,
     worlds: bool,
 ) -> tuple[Any, Inputs]:
     def one(key: jax.Array, world: World) -> tuple[Any, Inputs]:
         start_key, key = jax.random.split(key)
-        start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
-        return simulate.simulate(key, world, noise, start, scenario=scenario, scan=scans)
+        start = prior.mean if scenario.exact_prior else simulation.draw_pose(start_key, prior)
+        return simulation.simulate(key, world, noise, start, scenario=scenario, scan=scans)
 
     return jax.vmap(one, in_axes=(0, 0 if worlds else None))(keys, world)
 

@@ -21,8 +21,8 @@ import numpy as np
 import scipy.special
 
 from jaxlocmap import consistency
-from jaxlocmap.foresight import Foresight, foresee
-from jaxlocmap.linalg import Matrix, ldl
+from jaxlocmap._internal.linalg import Matrix, ldl
+from jaxlocmap.mapping.predictive import Foresight, foresee
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.tuning.filtering import Judged, check_batch, filtered
 from jaxlocmap.tuning.forward import forward

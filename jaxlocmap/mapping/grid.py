@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap.batching import any_in_batch, at_once, zero_like_any
-from jaxlocmap.beams import Lines, flat_cells, longest_crossing, on_map, trace
+from jaxlocmap._internal.batching import any_in_batch, at_once, zero_like_any
+from jaxlocmap.mapping.rays import Lines, flat_cells, longest_crossing, on_map, trace
 from jaxlocmap.types import GridSpec
 
 

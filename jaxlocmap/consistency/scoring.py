@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import consistency, grid
-from jaxlocmap.stages import Sighting
+from jaxlocmap import consistency
+from jaxlocmap.mapping import grid
+from jaxlocmap.simulation.world import World, occupancy
+from jaxlocmap.step import Sighting
 from jaxlocmap.types import Config, Gaussian
-from jaxlocmap.world import World, occupancy
 
 PHASES = 4  # equal parts of a drive, each with an average NEES of its own
 # Edges of the bins in which runs are counted by their average NEES, for a median: 5 % apart. What lies beyond counts in

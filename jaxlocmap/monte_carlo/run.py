@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import chunks, hosts
-from jaxlocmap.hosts import use_all_cores
-from jaxlocmap.parts import Parts, Split, manifest
+from jaxlocmap.monte_carlo import chunks, hosts
+from jaxlocmap.monte_carlo.checkpoint import Parts, Split, manifest
+from jaxlocmap.monte_carlo.hosts import use_all_cores
 
 __all__ = ["Result", "monte_carlo", "use_all_cores"]
 

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap import checks, grid
-from jaxlocmap.batching import scan, zero_like_any
-from jaxlocmap.beams import flat_cells, longest_crossing, trace
+from jaxlocmap import checks
+from jaxlocmap._internal.batching import scan, zero_like_any
+from jaxlocmap.mapping import grid
+from jaxlocmap.mapping.rays import flat_cells, longest_crossing, trace
 from jaxlocmap.types import GridSpec
 
 BINS = 10  # of probability

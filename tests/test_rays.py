@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import reference
 
-from jaxlocmap import GridSpec, beams
+from jaxlocmap import GridSpec
+from jaxlocmap.mapping import rays
 
 # So long a reach that integers are divided, and one that float32 does for; where it cuts no beam both give the same.
 REACHES = {"float32": 70.0, "integers": 2000.0}
@@ -17,7 +18,7 @@ both_forms = pytest.mark.parametrize("max_range", REACHES.values(), ids=REACHES)
 
 @functools.partial(jax.jit, static_argnames=("spec", "min_range", "max_range"))
 def cells(pose, ranges, angles, *, spec, min_range=0.0, max_range):
-    return beams.beam_cells(pose, ranges, angles, spec=spec, min_range=min_range, max_range=max_range)
+    return rays.beam_cells(pose, ranges, angles, spec=spec, min_range=min_range, max_range=max_range)
 
 
 def cells_to(ends, *, resolution, shape, start, max_range):
@@ -95,9 +96,9 @@ def test_beams_of_a_thousand_cells_are_bresenhams(reach):
 
 def lines_of(span, n, exact):
     """Lines that span so many cells along one axis, n along the other."""
-    slope, offset = beams._steps(jnp.stack([span, span]), n[None], exact)
+    slope, offset = rays._steps(jnp.stack([span, span]), n[None], exact)
     whole = jnp.zeros_like(n)
-    return beams.Lines(jnp.zeros(2, jnp.int32), slope, offset, free=whole, last=whole)
+    return rays.Lines(jnp.zeros(2, jnp.int32), slope, offset, free=whole, last=whole)
 
 
 @pytest.mark.parametrize("n", [1, 30, 997, 1023, 1024])
@@ -105,7 +106,7 @@ def test_float32_places_every_cell_where_integers_do(n):
     """Of all beams of n cells, to either side, up to the longest for which it is used."""
     m = jnp.arange(-n, n + 1, dtype=jnp.int32)
     many, j = jnp.full_like(m, n), jnp.arange(n + 1, dtype=jnp.int32)[None]
-    fast, slow = (jax.jit(beams._along, static_argnums=1)(lines_of(m, many, exact), 0, j) for exact in (True, False))
+    fast, slow = (jax.jit(rays._along, static_argnums=1)(lines_of(m, many, exact), 0, j) for exact in (True, False))
     np.testing.assert_array_equal(fast, slow)
     x, y = abs(np.asarray(m, np.int64))[:, None], np.asarray(j, np.int64)
     np.testing.assert_array_equal(slow, np.sign(m)[:, None] * -((n - 2 * y * x) // (2 * n)))  # ceil(j m / n - 1/2)
@@ -115,7 +116,7 @@ def test_float32_places_every_cell_where_integers_do(n):
 def test_float32_counts_the_cells_inside_as_integers_do(n):
     """Of all beams of n cells from all places; also where a compiler divides by taking a reciprocal."""
     m, start = jnp.arange(-n, n + 1, dtype=jnp.int32)[None], jnp.arange(n + 2, dtype=jnp.int32)[:, None]
-    inside = jax.jit(lambda exact: beams._cells_inside(m, jnp.int32(n), start, n + 2, exact), static_argnums=0)
+    inside = jax.jit(lambda exact: rays._cells_inside(m, jnp.int32(n), start, n + 2, exact), static_argnums=0)
     fast, slow = inside(True), inside(False)
     np.testing.assert_array_equal(np.minimum(fast, n + 1), slow)
     # Cell j is the first outside where it is, and j - 1 is not.
@@ -147,14 +148,14 @@ def test_products_that_do_not_fit_are_divided_as_pythons_integers_are():
     b = rng.integers(0, c, endpoint=True)
     edges = [(2**20, 2**21, 2**21), (2**20 - 1, 2**21 - 1, 2**21), (2**20, 2**20, 2**20), (0, 0, 1), (1023, 1, 1)]
     a, b, c = (np.append(x, y) for x, y in zip((a, b, c), zip(*edges, strict=True), strict=True))
-    got = jax.jit(beams._times_over)(*(jnp.asarray(x, jnp.int32) for x in (a, b, c)))
+    got = jax.jit(rays._times_over)(*(jnp.asarray(x, jnp.int32) for x in (a, b, c)))
     np.testing.assert_array_equal(got, np.divmod(a * b, c))  # in 64 bits
 
 
 @functools.partial(jax.jit, static_argnames=("spec", "max_range"))
 def some_cells(pose, ranges, angles, j, *, spec, max_range):
-    lines = beams.trace(pose, ranges, angles, spec=spec, min_range=0.0, max_range=max_range)
-    return lines.free, lines.last, beams.cells_at(lines, j)
+    lines = rays.trace(pose, ranges, angles, spec=spec, min_range=0.0, max_range=max_range)
+    return lines.free, lines.last, rays.cells_at(lines, j)
 
 
 @pytest.mark.usefixtures("x64")
@@ -192,7 +193,7 @@ def test_a_very_long_beam_is_bresenhams(n):
 )
 def test_float32_is_for_beams_of_1024_cells_on_maps_of_2_to_the_24(reach, shape, exact):
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=shape)
-    trace = functools.partial(beams.trace, spec=spec, min_range=0.0, max_range=reach * 0.5)
+    trace = functools.partial(rays.trace, spec=spec, min_range=0.0, max_range=reach * 0.5)
     lines = jax.eval_shape(trace, jnp.zeros(3), jnp.zeros(2), jnp.zeros(2))
     assert {lines.slope.dtype, lines.offset.dtype} == {jnp.dtype(jnp.float32 if exact else jnp.int32)}
 
@@ -216,7 +217,7 @@ def test_every_cell_of_a_beam_of_9000_cells_is_bresenhams():
 def test_beams_of_more_cells_than_can_be_counted_are_refused():
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.05, shape=(10, 10))
     with pytest.raises(ValueError, match=r"^max_range: expected beams of up to 1,048,576 cells, got 60000\.0 m"):
-        beams.trace(jnp.zeros(3), jnp.ones(2), jnp.zeros(2), spec=spec, min_range=0.0, max_range=6e4)
+        rays.trace(jnp.zeros(3), jnp.ones(2), jnp.zeros(2), spec=spec, min_range=0.0, max_range=6e4)
 
 
 @pytest.mark.usefixtures("x64")
@@ -226,9 +227,9 @@ def test_flat_cells_are_rows_and_columns_also_of_a_map_too_large_for_float32():
 
     @jax.jit
     def both(pose, ranges, angles):
-        lines = beams.trace(pose, ranges, angles, spec=spec, min_range=0.0, max_range=5.0)
+        lines = rays.trace(pose, ranges, angles, spec=spec, min_range=0.0, max_range=5.0)
         j = jnp.arange(6, dtype=jnp.int32)[None]
-        return beams.cells_at(lines, j), beams.flat_cells(lines, j, spec)
+        return rays.cells_at(lines, j), rays.flat_cells(lines, j, spec)
 
     (column, row), flat = both(jnp.array([340_000.02, 0.05, np.pi / 2]), jnp.full(3, 0.55), jnp.array([0.0, 0.3, -0.3]))
     assert row.max() == 5
@@ -242,21 +243,21 @@ SPEC = GridSpec(origin=(-1.0, 0.5), resolution=0.25, shape=(16, 24))  # x from -
 
 def test_cell_of_a_point_is_a_floor_and_may_lie_outside():
     points = jnp.array([[-1.0, 0.5], [-1.01, 0.49], [4.99, 4.49], [5.0, 4.5]])
-    np.testing.assert_array_equal(beams.cell_of(points, SPEC), [[0, 0], [-1, -1], [23, 15], [24, 16]])
+    np.testing.assert_array_equal(rays.cell_of(points, SPEC), [[0, 0], [-1, -1], [23, 15], [24, 16]])
 
 
 @pytest.mark.usefixtures("x64")
 def test_a_point_millions_of_cells_away_is_in_its_own():
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.1, shape=(2, 5_000_000))
     point = jnp.array([[123_456.78, 0.05], [-400_000.01, 3e6]])
-    np.testing.assert_array_equal(beams.cell_of(point, spec), [[1_234_567, 0], [-4_000_001, 30_000_000]])
-    assert beams.on_map(jnp.array([499_999.95, 0.05, 0.0]), spec)
-    assert not beams.on_map(jnp.array([500_000.05, 0.05, 0.0]), spec)
+    np.testing.assert_array_equal(rays.cell_of(point, spec), [[1_234_567, 0], [-4_000_001, 30_000_000]])
+    assert rays.on_map(jnp.array([499_999.95, 0.05, 0.0]), spec)
+    assert not rays.on_map(jnp.array([500_000.05, 0.05, 0.0]), spec)
 
 
 @pytest.mark.parametrize("far", [1e9, 1e20, np.inf, np.nan])
 def test_a_point_beyond_all_integers_is_far_outside(far):
-    below, above = np.asarray(beams.cell_of(jnp.array([[-far, -far], [far, far]]), SPEC))
+    below, above = np.asarray(rays.cell_of(jnp.array([[-far, -far], [far, far]]), SPEC))
     assert np.all(below <= -(2**29))
     assert np.all(abs(above) >= 2**29)
 
@@ -275,7 +276,7 @@ def test_a_point_beyond_all_integers_is_far_outside(far):
     ],
 )
 def test_a_pose_on_the_map_is_one_on_a_cell_with_a_heading(pose, there):
-    assert bool(beams.on_map(jnp.array(pose), SPEC)) is there
+    assert bool(rays.on_map(jnp.array(pose), SPEC)) is there
 
 
 def test_the_heading_turns_the_beams():
@@ -290,8 +291,8 @@ def test_the_heading_turns_the_beams():
 def test_shapes_that_do_not_fit_are_refused():
     limits = {"spec": SPEC, "min_range": 0.0, "max_range": 4.0}
     with pytest.raises(ValueError, match=r"^pose: expected shape \(3\), got \(2,\)"):
-        beams.beam_cells(jnp.zeros(2), jnp.ones(3), jnp.zeros(3), **limits)
+        rays.beam_cells(jnp.zeros(2), jnp.ones(3), jnp.zeros(3), **limits)
     with pytest.raises(ValueError, match=r"^beam_angles: expected shape \(any\), got \(3, 1\)"):
-        beams.beam_cells(jnp.zeros(3), jnp.ones(3), jnp.zeros((3, 1)), **limits)
+        rays.beam_cells(jnp.zeros(3), jnp.ones(3), jnp.zeros((3, 1)), **limits)
     with pytest.raises(ValueError, match=r"^ranges: expected shape \(3\), got \(2,\)"):
-        beams.trace(jnp.zeros(3), jnp.ones(2), jnp.zeros(3), **limits)
+        rays.trace(jnp.zeros(3), jnp.ones(2), jnp.zeros(3), **limits)

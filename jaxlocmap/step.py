@@ -7,9 +7,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap import checks, ekf, grid
-from jaxlocmap import landmarks as sensor
-from jaxlocmap.linalg import Matrix, is_psd, stack
+from jaxlocmap import checks
+from jaxlocmap import sensors as sensor
+from jaxlocmap._internal.linalg import Matrix, is_psd, stack
+from jaxlocmap.filters import ekf
+from jaxlocmap.mapping import grid
 from jaxlocmap.motion import resolve
 from jaxlocmap.types import Config, Gaussian, GridSpec, Params
 

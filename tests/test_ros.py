@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from jaxlocmap import GridSpec
-from jaxlocmap.mapfile import FREE, OCCUPIED, UNKNOWN, load_map, save_map, trinary
+from jaxlocmap.mapping.ros import FREE, OCCUPIED, UNKNOWN, load_map, save_map, trinary
 
 SHEET = "image: map.pgm\nresolution: 0.5\norigin: [1, 2, 0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
 GREYS = bytes([0, 254, 205, 100, 205, 205])  # 3 columns, 2 rows, the upper row first

@@ -7,7 +7,7 @@ import pytest
 import reference
 
 from jaxlocmap import GridSpec
-from jaxlocmap.foresight import BINS, foresee, scan_log_loss
+from jaxlocmap.mapping.predictive import BINS, foresee, scan_log_loss
 
 SPEC = GridSpec(origin=(-1.0, -2.0), resolution=0.25, shape=(24, 20), l_min=-3.0, l_max=2.5)
 ANGLES = np.linspace(-1.5, 1.5, 7)

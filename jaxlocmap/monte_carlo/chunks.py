@@ -16,7 +16,7 @@ from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from jaxlocmap import batching
+from jaxlocmap._internal import batching
 
 
 class Limits(NamedTuple):

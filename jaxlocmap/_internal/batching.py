@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
 
-from jaxlocmap.linalg import stack
+from jaxlocmap._internal.linalg import stack
 
 RUNS = "runs"  # the name of the axis of a chunk's runs
 _SMALL = 9  # entries: up to here an array is taken apart, such as the covariance of a pose

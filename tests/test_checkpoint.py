@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 from disks import full_disk
 
-from jaxlocmap import chunks
-from jaxlocmap import parts as parts_module
-from jaxlocmap.lock import Lock
-from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.parts import Parts, Split, manifest
+from jaxlocmap.monte_carlo import checkpoint as parts_module
+from jaxlocmap.monte_carlo import chunks, monte_carlo
+from jaxlocmap.monte_carlo.checkpoint import Parts, Split, manifest
+from jaxlocmap.monte_carlo.lock import Lock
 
 STUDY = {"runs": 30, "chunk": 4, "seed": 1}  # 8 chunks, each a part, the last of 2 runs
 ARRAYS = (np.arange(5.0) / 3, np.array([True, False]), np.zeros((0, 2), np.int32))

@@ -13,21 +13,22 @@ import pytest
 import reference
 import scipy.stats
 
-from jaxlocmap import Config, Gaussian, GridSpec, motion, normals, simulate, trig
-from jaxlocmap.simulate import CAPSTONE, LOOP, Noise, Scenario
-from jaxlocmap.world import World, occupancy, ray_cast, room
+from jaxlocmap import Config, Gaussian, GridSpec, motion, simulation
+from jaxlocmap._internal import random, trig
+from jaxlocmap.simulation import CAPSTONE, LOOP, Noise, Scenario
+from jaxlocmap.simulation.world import World, occupancy, ray_cast, room
 
 BOX = (4.5, 4.0, 7.5, 6.5)  # the box in the room: low x, low y, high x, high y, m
 SHORT = dataclasses.replace(CAPSTONE, name="short", steps=12, beams=5, sight_period=4)
 FAILURE = 1e-6  # probability with which a statistical bound is missed by a right program
 
-draw_poses = jax.jit(jax.vmap(simulate.draw_pose, in_axes=(0, None)))
-simulated = jax.jit(simulate.simulate, static_argnames=("scenario", "scan"))
+draw_poses = jax.jit(jax.vmap(simulation.draw_pose, in_axes=(0, None)))
+simulated = jax.jit(simulation.simulate, static_argnames=("scenario", "scan"))
 
 
 @functools.partial(jax.jit, static_argnames=("scenario", "scan"))
 def simulated_by_key_and_start(keys, world, noise, starts, *, scenario, scan):
-    one = functools.partial(simulate.simulate, scenario=scenario, scan=scan)
+    one = functools.partial(simulation.simulate, scenario=scenario, scan=scan)
     return jax.vmap(one, in_axes=(0, None, None, 0))(keys, world, noise, starts)
 
 
@@ -79,8 +80,8 @@ def test_given_the_course_s_random_numbers_the_drive_is_the_course_s(tolerance):
     """Its detector decides by what it measures, so everything is reported here and then cut as it does."""
     draws, expected = reference.course_draws(seed=4), reference.course_run(seed=4)
     noise = Noise()
-    truth, inputs = jax.jit(simulate.roll_out, static_argnames="scenario")(
-        simulate.Draws(
+    truth, inputs = jax.jit(simulation.roll_out, static_argnames="scenario")(
+        simulation.Draws(
             drive=jnp.array(np.column_stack([draws["heading"] / noise.heading, draws["control"] / [noise.v, noise.w]])),
             sighting=jnp.array(draws["detector"] / [noise.range, noise.bearing]),
             scan=jnp.array(draws["scan"] / noise.scan),
@@ -107,7 +108,7 @@ def test_the_scenario_holds_the_course_s_constants():
     np.testing.assert_allclose(prior.mean, reference.COURSE_PRIOR_MEAN)
     np.testing.assert_allclose(prior.cov, reference.COURSE_PRIOR_COV, rtol=1e-6)
     np.testing.assert_allclose(CAPSTONE.beam_angles(), reference.COURSE_ANGLES, rtol=1e-6)
-    params = simulate.course_params()
+    params = simulation.course_params()
     np.testing.assert_allclose(params.Q, reference.COURSE_Q, rtol=1e-6)
     np.testing.assert_allclose(params.R, reference.COURSE_R, rtol=1e-6)
     amounts = [reference.COURSE_SCAN[name] for name in ("l_occ", "l_free")]
@@ -184,7 +185,7 @@ def test_the_loop_keeps_half_a_metre_from_every_wall_and_comes_back(loops):
 @functools.partial(jax.jit, static_argnames="scenario")
 def three(keys, worlds, noises, starts, *, scenario):
     """Three drives at once that share nothing."""
-    return jax.vmap(functools.partial(simulate.simulate, scenario=scenario))(keys, worlds, noises, starts)
+    return jax.vmap(functools.partial(simulation.simulate, scenario=scenario))(keys, worlds, noises, starts)
 
 
 def settings_of_three():
@@ -230,7 +231,7 @@ def test_a_drive_depends_on_its_key_and_not_on_its_company():
 def test_neither_compiling_nor_leaving_out_the_scanner_changes_the_drive(tolerance):
     args = (jax.random.key(0), room(), Noise(), jnp.array(SHORT.start))
     truth, inputs = simulated(*args, scenario=SHORT)
-    plain_truth, plain_inputs = simulate.simulate(*args, scenario=SHORT, scan=False)
+    plain_truth, plain_inputs = simulation.simulate(*args, scenario=SHORT, scan=False)
     assert plain_inputs.ranges is None
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=0, atol=tolerance(1e-12, 1e-5)),
@@ -258,13 +259,13 @@ def test_no_two_uses_of_a_step_share_a_random_number(monkeypatch):
         taken.extend(np.stack(np.broadcast_arrays(*map(np.atleast_1d, counter)), axis=-1).tolist())
         return counter
 
-    monkeypatch.setattr(normals, "threefry", recording)
+    monkeypatch.setattr(random, "threefry", recording)
     words, scenario = (0, 0), dataclasses.replace(CAPSTONE, outliers=True)
     for k in (0, 1, 2**20, 2**30):
-        simulate.draw_drive(words, k, float)
+        simulation.draw_drive(words, k, float)
         for j in range(30):
-            simulate.draw_sighting(words, k, j, scenario=scenario, dtype=float)
-        simulate.draw_scan(words, k, scenario=scenario, dtype=float)
+            simulation.draw_sighting(words, k, j, scenario=scenario, dtype=float)
+        simulation.draw_scan(words, k, scenario=scenario, dtype=float)
     assert len(taken) == len({tuple(counter) for counter in taken}) == 4 * (2 + 30 * 3 + CAPSTONE.beams)
 
 
@@ -392,7 +393,7 @@ def test_a_detector_off_the_centre_sees_from_where_it_sits(offset, tolerance):
     for turn in np.linspace(-3, 3, 7):
         mark = pose[:2] + 2.9 * np.array([np.cos(turn), np.sin(turn)])
         to = mark - sensor
-        z, near = simulate.sight(jnp.zeros(2), jnp.array(pose), jnp.array(mark), Noise(), scenario=scenario)
+        z, near = simulation.sight(jnp.zeros(2), jnp.array(pose), jnp.array(mark), Noise(), scenario=scenario)
         assert bool(near) == (np.hypot(*to) < 3)
         np.testing.assert_allclose(z[0], np.hypot(*to), rtol=0, atol=tolerance(1e-12, 1e-5))
         turned = reference.wrap(float(z[1]) - (np.arctan2(to[1], to[0]) - pose[2] - dtheta))
@@ -411,7 +412,7 @@ def test_a_detector_at_the_centre_costs_nothing():
         return jnp.stack([reach, motion.wrap(bearing)]), near
 
     args = jnp.zeros(2), jnp.zeros(3), jnp.ones(2)
-    ours = jax.make_jaxpr(lambda *args: simulate.sight(*args, Noise(), scenario=SHORT))(*args)
+    ours = jax.make_jaxpr(lambda *args: simulation.sight(*args, Noise(), scenario=SHORT))(*args)
     assert sorted(eqn.primitive.name for eqn in ours.eqns) == sorted(
         eqn.primitive.name for eqn in jax.make_jaxpr(centred)(*args).eqns
     )
@@ -428,9 +429,9 @@ def test_a_drive_goes_by_the_robot_s_own_period_reach_and_looks(tolerance):
     """Without noise: a step of a quarter of a second, looks at steps 0 and 3 up to 3 m, a scan up to 2 m."""
     scenario = dataclasses.replace(OTHER, command=lambda k, pose: jnp.stack([1.0 + 0 * pose[0], 0.4 + 0 * pose[0]]))
     none = Noise(*[0.0] * len(Noise._fields))
-    draws = simulate.Draws(jnp.ones((6, 3)), jnp.ones((6, 4, 2)), jnp.ones((6, 5)))
+    draws = simulation.Draws(jnp.ones((6, 3)), jnp.ones((6, 4, 2)), jnp.ones((6, 5)))
     start = jnp.array([1.0, 9.0, 0.3])
-    truth, inputs = simulate.roll_out(draws, room(), none, start, scenario=scenario)
+    truth, inputs = simulation.roll_out(draws, room(), none, start, scenario=scenario)
     pose, poses = np.array(start, float), []
     for _ in range(6):
         pose = pose + 0.25 * np.array([np.cos(pose[2]), np.sin(pose[2]), 0.4])
@@ -453,14 +454,14 @@ def test_a_scan_s_noise_comes_after_the_cut_at_its_reach_and_ends_at_its_least_r
     """Nothing but one wall, 0.4 m ahead: beam by beam, what each draw makes of it."""
     around = World(jnp.array([[(0.4, -0.05), (0.4, 0.05)]]), jnp.zeros((0, 2)))
     draws = jnp.array([1.0, -1.0, -2.0, 0.5, -30.0])
-    got = simulate.look_round(draws, jnp.zeros(3), around, Noise(scan=0.1), scenario=OTHER)
+    got = simulation.look_round(draws, jnp.zeros(3), around, Noise(scan=0.1), scenario=OTHER)
     np.testing.assert_allclose(got, [2.1, 1.9, 0.3, 2.05, 0.3], rtol=1e-6)  # the middle one: 0.4 - 0.2 is below 0.3
 
 
 def test_a_landmark_at_the_very_reach_is_not_seen():
     for reach, near in ((3.0, False), (np.nextafter(np.float32(3), np.float32(0)), True)):
         mark = jnp.array([float(reach), 0.0])
-        assert bool(simulate.sight(jnp.zeros(2), jnp.zeros(3), mark, Noise(), scenario=OTHER)[1]) is near
+        assert bool(simulation.sight(jnp.zeros(2), jnp.zeros(3), mark, Noise(), scenario=OTHER)[1]) is near
 
 
 @pytest.mark.parametrize(("drawn", "false"), [(0.29, True), (0.31, False)])
@@ -468,7 +469,7 @@ def test_a_false_sighting_is_made_of_its_own_draws(drawn, false):
     """Anywhere within the robot's own reach, and all around; what is drawn decides whether it is one."""
     draws, noise = jnp.array([1.0, -1.0, drawn, 0.25, 0.875]), Noise(range=0.1, bearing=0.2, outlier_rate=0.3)
     scenario = dataclasses.replace(OTHER, outliers=True)
-    z, near = simulate.sight(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), noise, scenario=scenario)
+    z, near = simulation.sight(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), noise, scenario=scenario)
     assert near
     np.testing.assert_allclose(z, [0.75, 0.75 * np.pi] if false else [2.1, -0.2], rtol=1e-6)
 
@@ -477,7 +478,7 @@ def test_what_a_step_s_draws_are_for(tolerance):
     """The first turns the robot, the second and third are in what it measures alone."""
     noise, pose, expected = Noise(heading=0.1, v=0.2, w=0.3), jnp.zeros(3), reference.course_control(0)
     for i, (turn, control) in enumerate([(0.1, (0, 0)), (0, (0.2, 0)), (0, (0, 0.3))]):
-        moved, measured = simulate.drive(jnp.eye(3)[i], jnp.array(0), pose, noise, scenario=SHORT)
+        moved, measured = simulation.drive(jnp.eye(3)[i], jnp.array(0), pose, noise, scenario=SHORT)
         by = np.array([0.1 * expected[0], 0, 0.1 * expected[1] + turn])
         np.testing.assert_allclose(moved, by, rtol=0, atol=tolerance(1e-15, 1e-7))
         np.testing.assert_allclose(measured, expected + np.array(control), rtol=0, atol=tolerance(1e-15, 1e-7))
@@ -498,12 +499,12 @@ def test_the_loop_is_two_laps_whose_true_start_is_drawn_from_the_prior():
     assert LOOP.steps * LOOP.dt == 2 * 60
     assert (LOOP.exact_prior, CAPSTONE.exact_prior) == (False, True)
     np.testing.assert_allclose(LOOP.start, [9, 5.4, np.pi / 2])
-    assert simulate.SCENARIOS == {"capstone": CAPSTONE, "loop": LOOP}
+    assert simulation.SCENARIOS == {"capstone": CAPSTONE, "loop": LOOP}
 
 
 def test_the_robot_s_own_noise_as_a_filter_has_it():
     """The heading noise of a step is what a yaw rate's of 0.02 / 0.5 would be: with 0.03 rad/s a 3-4-5 triangle."""
-    params = simulate.own_params(Noise(heading=0.02, v=0.1, w=0.03, range=0.2, bearing=0.3), 0.5)
+    params = simulation.own_params(Noise(heading=0.02, v=0.1, w=0.03, range=0.2, bearing=0.3), 0.5)
     np.testing.assert_allclose(params.Q, np.diag([0.01, 0.05**2]), rtol=1e-6)
     np.testing.assert_allclose(params.R, np.diag([0.04, 0.09]), rtol=1e-6)
 
@@ -512,7 +513,7 @@ def test_every_word_of_a_key_makes_another_drive():
     for kind, words in (("threefry2x32", 2), ("rbg", 4)):
         data = np.zeros((words + 1, words), np.uint32)
         data[1:] = np.eye(words)
-        made = [tuple(map(int, normals.words_of(jax.random.wrap_key_data(row, impl=kind)))) for row in data]
+        made = [tuple(map(int, random.words_of(jax.random.wrap_key_data(row, impl=kind)))) for row in data]
         assert len(set(made)) == words + 1
         assert all(a != b for one, other in itertools.combinations(made, 2) for a, b in zip(one, other, strict=True))
 
@@ -542,25 +543,25 @@ def test_a_batch_is_refused_by_name(atom, name):
         if atom == "draw_pose":
             some, around = {"prior": Gaussian(**some)}, {"key": jax.random.key(0)}
         with pytest.raises(ValueError, match=rf"^(noise\.)?{name}: expected shape .*, got {re.escape(str(wrong))}"):
-            getattr(simulate, atom)(**some, **around)
+            getattr(simulation, atom)(**some, **around)
 
 
 def test_draws_for_another_detector_or_another_drive_are_refused():
     args = jnp.zeros(3), jnp.ones(2), Noise()
     with pytest.raises(ValueError, match=r"^draws: expected shape \(5\), got \(2,\)$"):
-        simulate.sight(jnp.zeros(2), *args, scenario=FALSE)
-    draws = simulate.Draws(jnp.zeros((13, 3)), jnp.zeros((12, 4, 2)))
+        simulation.sight(jnp.zeros(2), *args, scenario=FALSE)
+    draws = simulation.Draws(jnp.zeros((13, 3)), jnp.zeros((12, 4, 2)))
     with pytest.raises(ValueError, match=r"^draws\.drive: expected shape \(12, 3\), got \(13, 3\)$"):
-        simulate.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
+        simulation.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
 
 
 @pytest.mark.parametrize("name", ["sighting", "scan"])
 def test_draws_of_another_shape_are_refused_by_name(name):
     shapes = {"drive": (12, 3), "sighting": (12, 4, 2), "scan": (12, 5)}
     for wrong in ((3, *shapes[name]), (*shapes[name][:-1], 1)):
-        draws = simulate.Draws(**{key: jnp.zeros(shape) for key, shape in (shapes | {name: wrong}).items()})
+        draws = simulation.Draws(**{key: jnp.zeros(shape) for key, shape in (shapes | {name: wrong}).items()})
         with pytest.raises(ValueError, match=rf"^draws\.{name}: expected shape .*, got {re.escape(str(wrong))}$"):
-            simulate.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
+            simulation.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
 
 
 @pytest.mark.parametrize("steps", [(1,), (5,), (5, 2)])
@@ -569,10 +570,10 @@ def test_random_numbers_are_those_of_one_step_and_one_landmark(steps):
     words, one, many = (0, 0), jnp.array(0), jnp.zeros(steps, int)
     kind = {"scenario": SHORT, "dtype": float}
     for name, draw in (
-        ("k", lambda: simulate.draw_drive(words, many, float)),
-        ("k", lambda: simulate.draw_sighting(words, many, one, **kind)),
-        ("j", lambda: simulate.draw_sighting(words, one, many, **kind)),
-        ("k", lambda: simulate.draw_scan(words, many, **kind)),
+        ("k", lambda: simulation.draw_drive(words, many, float)),
+        ("k", lambda: simulation.draw_sighting(words, many, one, **kind)),
+        ("j", lambda: simulation.draw_sighting(words, one, many, **kind)),
+        ("k", lambda: simulation.draw_scan(words, many, **kind)),
     ):
         with pytest.raises(ValueError, match=rf"^{name}: expected shape \(\), got {re.escape(str(steps))}$"):
             draw()
@@ -581,7 +582,7 @@ def test_random_numbers_are_those_of_one_step_and_one_landmark(steps):
 @pytest.mark.parametrize("keys", [jax.random.key, jax.random.PRNGKey])
 def test_many_keys_are_refused_by_name(keys):
     with pytest.raises(ValueError, match=r"^key: expected shape .*, got \(5"):
-        simulate.simulate(jax.random.split(keys(0), 5), room(), Noise(), jnp.zeros(3), scenario=SHORT)
+        simulation.simulate(jax.random.split(keys(0), 5), room(), Noise(), jnp.zeros(3), scenario=SHORT)
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0, math.nan, 0.0)])
@@ -598,12 +599,12 @@ FALSE = dataclasses.replace(SHORT, name="false", outliers=True)
 @functools.partial(jax.jit, static_argnames=("scenario", "count"))
 def sighted(distance, noise, *, scenario, count):
     """What the detector makes of a landmark straight ahead, at as many steps."""
-    words = normals.words_of(jax.random.key(7))
+    words = random.words_of(jax.random.key(7))
     pose, landmark = jnp.zeros(3), jnp.stack([distance, jnp.zeros_like(distance)])
 
     def one(k):
-        draws = simulate.draw_sighting(words, k, 2, scenario=scenario, dtype=float)
-        return simulate.sight(draws, pose, landmark, noise, scenario=scenario)
+        draws = simulation.draw_sighting(words, k, 2, scenario=scenario, dtype=float)
+        return simulation.sight(draws, pose, landmark, noise, scenario=scenario)
 
     return jax.vmap(one)(jnp.arange(count))
 

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from jaxlocmap import files
-from jaxlocmap.lock import Lock
+from jaxlocmap.monte_carlo.lock import Lock
 
 _PARTS = 256  # at most: so little of a long study is lost when it dies
 _SYNC_EVERY = 1.0  # s; forcing a file to disk takes milliseconds, a quick study's part less

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap.batching import zero_like_any
-from jaxlocmap.trig import sin_cos
+from jaxlocmap._internal.batching import zero_like_any
+from jaxlocmap._internal.trig import sin_cos
 from jaxlocmap.types import GridSpec
 
 

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap.linalg import Matrix, mahalanobis, sandwich
+from jaxlocmap._internal.linalg import Matrix, mahalanobis, sandwich
+from jaxlocmap._internal.trig import arctan2, sin_cos
 from jaxlocmap.motion import wrap
-from jaxlocmap.trig import arctan2, sin_cos
 
 Offset = tuple[float, float, float]
 

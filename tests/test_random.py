@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxlocmap import normals
+from jaxlocmap._internal import random
 
 FAILURE = 1e-6  # probability with which a statistical bound is missed by a right program
 COUNT = 1 << 17  # numbers that a statistic is taken of
 KEY = (jnp.uint32(0x243F6A88), jnp.uint32(0x85A308D3))
 
 draw = functools.partial(jax.jit, static_argnums=(3, 4))
-draw_normals, draw_uniforms = draw(normals.normals), draw(normals.uniforms)
+draw_normals, draw_uniforms = draw(random.normals), draw(random.uniforms)
 
 
 def words(value):
@@ -36,13 +36,13 @@ def words(value):
 )
 def test_the_words_its_authors_publish(key, counter, expected):
     """kat_vectors of Random123, threefry2x32 with 20 rounds."""
-    assert tuple(map(int, normals.threefry(words(key), words(counter)))) == expected
+    assert tuple(map(int, random.threefry(words(key), words(counter)))) == expected
 
 
 def test_the_generator_is_jaxs_bit_for_bit():
     key, counter = np.random.default_rng(0).integers(2**32, size=(2, 2, 500), dtype=np.uint32)
     counter[:, :2] = [[0, 2**32 - 1], [2**32 - 1, 0]]
-    got = jax.jit(normals.threefry)(tuple(key), tuple(counter))
+    got = jax.jit(random.threefry)(tuple(key), tuple(counter))
     jaxs = jax.vmap(jax.extend.random.threefry_2x32, in_axes=(1, 1), out_axes=1)(key, counter)
     np.testing.assert_array_equal(got, jaxs)
 
@@ -50,19 +50,19 @@ def test_the_generator_is_jaxs_bit_for_bit():
 @pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
 def test_every_key_of_jax_has_words_of_its_own(kind):
     keys = jax.random.split(jax.random.key(0, impl=kind), 200)
-    every = np.column_stack(jax.vmap(normals.words_of)(keys))
+    every = np.column_stack(jax.vmap(random.words_of)(keys))
     assert every.dtype == np.uint32
     assert len(np.unique(every, axis=0)) == len(keys)
-    np.testing.assert_array_equal(np.ravel(normals.words_of(keys[7])), every[7])  # alone as in a batch
+    np.testing.assert_array_equal(np.ravel(random.words_of(keys[7])), every[7])  # alone as in a batch
 
 
 @pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
 def test_every_word_of_a_key_matters_to_both_of_its_words(kind):
     data = np.arange(1, 1 + jax.random.key_data(jax.random.key(0, impl=kind)).size, dtype=np.uint32)
     every = np.array([data, *(data + 2**31 * np.eye(data.size, dtype=np.uint32))], np.uint32)
-    got = np.array([normals.words_of(jax.random.wrap_key_data(jnp.array(each), impl=kind)) for each in every])
+    got = np.array([random.words_of(jax.random.wrap_key_data(jnp.array(each), impl=kind)) for each in every])
     assert all(len(np.unique(column)) == len(every) for column in got.T)
-    np.testing.assert_array_equal(normals.words_of(jnp.array(data)), got[0])  # as a plain array
+    np.testing.assert_array_equal(random.words_of(jnp.array(data)), got[0])  # as a plain array
 
 
 # --- Streams ---
@@ -78,7 +78,7 @@ def counters_of(monkeypatch, *draws):
         taken.append(np.stack([np.atleast_1d(np.asarray(x)) for x in counter], axis=-1))
         return counter
 
-    monkeypatch.setattr(normals, "threefry", recording)
+    monkeypatch.setattr(random, "threefry", recording)
     every = []
     for form, step, lane, count in draws:
         taken.clear()
@@ -91,7 +91,7 @@ def counters_of(monkeypatch, *draws):
 
 def test_uses_that_take_lanes_apart_share_nothing(monkeypatch):
     """Two numbers a lane, or one where many are drawn at once."""
-    draws = [(normals.normals, 0, 0, 3), (normals.uniforms, 0, 2, 8), (normals.normals, 0, 6, 61)]
+    draws = [(random.normals, 0, 0, 3), (random.uniforms, 0, 2, 8), (random.normals, 0, 6, 61)]
     draws += [(form, step, lane, count) for step in (1, 2**31) for form, _, lane, count in draws]
     every = [use for uses in counters_of(monkeypatch, *draws) for use in uses]
     assert len(every) == len(set(every)) == 3 * (3 + 8 + 61)
@@ -101,7 +101,7 @@ def test_uses_that_take_lanes_apart_share_nothing(monkeypatch):
 def test_numbers_are_those_of_the_counters_they_say(count):
     """Both numbers of each counter, one after the other; where many are drawn at once, the first alone."""
     step, lane = 5, 40
-    uniform = (np.array([normals.threefry(KEY, words((step, lane + i))) for i in range(count)]) >> 9) + 0.5
+    uniform = (np.array([random.threefry(KEY, words((step, lane + i))) for i in range(count)]) >> 9) + 0.5
     uniform /= 2**23
     turn = 2 * np.pi * uniform[:, 1] - np.pi
     normal = np.sqrt(-2 * np.log(uniform[:, :1])) * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -127,7 +127,7 @@ def streams(kind):
             jax.vmap(stream, (None, None, 0))(KEY, 3, number),
         )
     else:
-        runs = jax.vmap(lambda i: normals.words_of(jax.random.fold_in(jax.random.key(0), i)))
+        runs = jax.vmap(lambda i: random.words_of(jax.random.fold_in(jax.random.key(0), i)))
         one, other = (jax.vmap(stream, (0, None, None))(runs(2 * number + i), 0, 0) for i in (0, 1))
     return np.asarray(one, np.float64).ravel(), np.asarray(other, np.float64).ravel()
 
@@ -162,7 +162,7 @@ def assert_distributed(values, distribution):
 
 @pytest.mark.parametrize("count", [3, 61])
 def test_normals_are_standard_normal(count):
-    values, reach = sample(normals.normals, count), scipy.stats.norm.isf(FAILURE / 2)
+    values, reach = sample(random.normals, count), scipy.stats.norm.isf(FAILURE / 2)
     # Moments and the variance of each power: E x^2n - (E x^n)^2.
     for power, moment, variance in ((1, 0, 1), (2, 1, 2), (3, 0, 15), (4, 3, 96)):
         assert abs(np.mean(values**power) - moment) < reach * np.sqrt(variance / values.size)
@@ -176,7 +176,7 @@ def test_normals_are_standard_normal(count):
 
 @pytest.mark.parametrize("count", [3, 61])
 def test_uniforms_are_even(count):
-    values = sample(normals.uniforms, count)
+    values = sample(random.uniforms, count)
     assert_distributed(values, scipy.stats.uniform)
     assert values.min() > 0
     assert values.max() < 1
@@ -186,14 +186,14 @@ def test_uniforms_are_even(count):
 def test_the_first_and_last_word_give_numbers(monkeypatch, dtype):
     """Neither end of (0, 1) is reached, so no normal is infinite, and none is no number."""
     ends = jnp.uint32(0), jnp.uint32(2**32 - 1)
-    monkeypatch.setattr(normals, "threefry", lambda *_: ends)
-    low, high = normals.uniforms(KEY, 0, 0, 2, dtype)
+    monkeypatch.setattr(random, "threefry", lambda *_: ends)
+    low, high = random.uniforms(KEY, 0, 0, 2, dtype)
     assert (float(low), float(high)) == (2.0**-24, 1 - 2.0**-24)
-    far, aside = normals.normals(KEY, 0, 0, 2, dtype)
+    far, aside = random.normals(KEY, 0, 0, 2, dtype)
     assert float(far) == pytest.approx(-np.sqrt(48 * np.log(2)), rel=1e-6)  # 5.77: beyond are 1e-8 of a normal's
     assert float(aside) == pytest.approx(0, abs=4e-6)
-    monkeypatch.setattr(normals, "threefry", lambda *_: ends[::-1])
-    assert float(normals.normals(KEY, 0, 0, 1, dtype)[0]) == pytest.approx(-np.sqrt(2.0**-23), rel=1e-5)
+    monkeypatch.setattr(random, "threefry", lambda *_: ends[::-1])
+    assert float(random.normals(KEY, 0, 0, 1, dtype)[0]) == pytest.approx(-np.sqrt(2.0**-23), rel=1e-5)
 
 
 # --- However they are drawn ---
@@ -215,7 +215,7 @@ def test_both_precisions_give_the_same_numbers(count):
 @pytest.mark.parametrize("count", [2, 9])
 def test_a_batch_and_a_loop_give_what_each_gives_alone(count):
     steps, lanes = jnp.arange(6), 5 * jnp.arange(6) + 1
-    keys = jax.vmap(normals.words_of)(jax.random.split(jax.random.key(1), 6))
+    keys = jax.vmap(random.words_of)(jax.random.split(jax.random.key(1), 6))
     alone = [draw_normals((keys[0][i], keys[1][i]), steps[i], lanes[i], count, jnp.float32) for i in range(len(steps))]
     together = jax.vmap(lambda key, k, lane: draw_normals(key, k, lane, count, jnp.float32))(keys, steps, lanes)
     _, in_a_loop = jax.lax.scan(

@@ -17,11 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import consistency, grid, simulate
-from jaxlocmap.batching import cond, scan, sum_over_runs, zero_like_any
-from jaxlocmap.normals import words_of
-from jaxlocmap.pipeline import init
-from jaxlocmap.scoring import (
+from jaxlocmap import consistency, simulation
+from jaxlocmap._internal.batching import cond, scan, sum_over_runs, zero_like_any
+from jaxlocmap._internal.random import words_of
+from jaxlocmap.consistency.scoring import (
     NEES_EDGES,
     PHASES,
     Latest,
@@ -37,9 +36,11 @@ from jaxlocmap.scoring import (
     score_sighting,
     score_step,
 )
-from jaxlocmap.stages import correct, map_scan, predict, sound
+from jaxlocmap.mapping import grid
+from jaxlocmap.pipeline import init
+from jaxlocmap.simulation.world import World
+from jaxlocmap.step import correct, map_scan, predict, sound
 from jaxlocmap.types import Config, Gaussian, Params, State
-from jaxlocmap.world import World
 
 __all__ = ["MapTotals", "Study", "Totals", "reference_study", "summarise"]
 
@@ -53,7 +54,7 @@ class Study:
     measurements nor the beliefs, which would have to travel to memory and back.
     """
 
-    scenario: simulate.Scenario
+    scenario: simulation.Scenario
     config: Config  # with a grid, the run maps too
 
     def __call__(
@@ -61,7 +62,7 @@ class Study:
         key: jax.Array,
         params: Params,
         world: World,
-        noise: simulate.Noise,
+        noise: simulation.Noise,
         prior: Gaussian,
         gate_probability: jax.Array | None = None,
         *,
@@ -87,7 +88,7 @@ class Study:
             config = dataclasses.replace(config, gate_probability=gate_probability)
         zero = zero_like_any(key, params, world, noise, prior, gate_probability).astype(dtype)
         start_key, key = jax.random.split(key)
-        start = prior.mean if scenario.exact_prior else simulate.draw_pose(start_key, prior)
+        start = prior.mean if scenario.exact_prior else simulation.draw_pose(start_key, prior)
         words = words_of(key)
         landmarks = jnp.arange(len(world.landmarks), dtype=jnp.int32)
         beam_angles = scenario.beam_angles().astype(dtype)
@@ -98,9 +99,9 @@ class Study:
             def one(carry: tuple[Gaussian, SightingTally], now: tuple[Any, ...]) -> tuple[Any, Latest]:
                 belief, tally = carry
                 j, x, y, latest = now
-                draws = simulate.draw_sighting(words, k, j, scenario=scenario, dtype=dtype)
+                draws = simulation.draw_sighting(words, k, j, scenario=scenario, dtype=dtype)
                 landmark = jnp.stack([x, y])
-                z, valid = simulate.sight(draws, pose, landmark, noise, scenario=scenario)
+                z, valid = simulation.sight(draws, pose, landmark, noise, scenario=scenario)
                 belief, sighting, used = correct(params, belief, z, landmark, j, valid, config=config)
                 one_more, latest = score_sighting(sighting, valid, used, latest)
                 return (belief, jax.tree.map(jnp.add, tally, one_more)), latest
@@ -115,12 +116,12 @@ class Study:
 
         def turn(carry: tuple[Any, ...], k: jax.Array) -> tuple[tuple[Any, ...], PerStep]:
             pose, belief, log_odds, latest, steps, sightings = carry
-            pose, control = simulate.drive(simulate.draw_drive(words, k, dtype), k, pose, noise, scenario=scenario)
+            pose, control = simulation.drive(simulation.draw_drive(words, k, dtype), k, pose, noise, scenario=scenario)
             belief, moved = predict(params, belief, control, jnp.asarray(scenario.dt, dtype), config=config)
             belief, seen, latest = cond(scenario.looks(k), sight, look_away, pose, k, belief, latest)
             if log_odds is not None:
-                draws = simulate.draw_scan(words, k, scenario=scenario, dtype=dtype)
-                ranges = simulate.look_round(draws, pose, world, noise, scenario=scenario)
+                draws = simulation.draw_scan(words, k, scenario=scenario, dtype=dtype)
+                ranges = simulation.look_round(draws, pose, world, noise, scenario=scenario)
                 log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
             ok = moved & (seen.unusable == 0) & sound(belief)
             phase = PHASES * k // scenario.steps
@@ -160,7 +161,7 @@ class Study:
         return self(key, *args, **kwargs, add_up=functools.partial(sum_over_runs, counted=counted))
 
     def carried(
-        self, key: jax.Array, params: Params, world: World, noise: simulate.Noise, prior: Gaussian, *_: Any
+        self, key: jax.Array, params: Params, world: World, noise: simulation.Noise, prior: Gaussian, *_: Any
     ) -> State:
         """What fills memory in the loop over time: the state of the filter, whose map outweighs all else.
 
@@ -329,10 +330,10 @@ def _map_fields(totals: MapTotals, runs: int) -> dict[str, Any]:
     }
 
 
-def reference_study(scenario: simulate.Scenario, config: Config, noise: simulate.Noise) -> tuple[Study, Params]:
+def reference_study(scenario: simulation.Scenario, config: Config, noise: simulation.Noise) -> tuple[Study, Params]:
     """The study of a filter that is told the truth, and what it is told: the robot's own noise and motion model.
 
     Its ANEES is what this start and this gate make of an honest covariance. It maps nothing.
     """
     told = dataclasses.replace(config, motion="euler", grid=None)
-    return Study(scenario, told), simulate.own_params(noise, scenario.dt)
+    return Study(scenario, told), simulation.own_params(noise, scenario.dt)

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap.trig import sin_cos
+from jaxlocmap._internal.trig import sin_cos
 
 Words = tuple[jax.Array, jax.Array]  # two uint32, () each
 

@@ -8,7 +8,7 @@ import scipy.stats
 from drives import ONLY_POSES, OWN, drives
 
 from jaxlocmap import tuning
-from jaxlocmap.tuning.certainty import _judge
+from jaxlocmap.tuning.standard_errors import _judge
 
 NAMES = ("w", "range")
 

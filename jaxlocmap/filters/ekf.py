@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import scipy.special
 
 from jaxlocmap import checks
-from jaxlocmap.linalg import Matrix, forward, ldl, sandwich, solve, stack, values
+from jaxlocmap._internal.linalg import Matrix, forward, ldl, sandwich, solve, stack, values
 from jaxlocmap.motion import MotionModel, wrap
 
 _LEAST_WEIGHT = 1e-6  # of an observation at a soft gate: an R of a million times its size says nothing any more

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import checks
-from jaxlocmap.trig import sin_cos
+from jaxlocmap._internal.trig import sin_cos
 from jaxlocmap.types import GridSpec
 
 # Beams of up to so many cells, on maps of up to so many, float32 places exactly; others take integer divisions.

@@ -1,0 +1,1 @@
+"""What only the compiler asks for: unrolled small matrices, vector sines and random bits, loops under `vmap`."""
