@@ -13,7 +13,7 @@ import numpy as np
 from common import CONSOLE, command_line, output_folder, saved, show, write_report
 
 from jaxlocmap import Inputs, Truth, consistency, init, plotting, run, simulation
-from jaxlocmap.mapping import grid
+from jaxlocmap.mapping import grid, quality
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,18 +30,18 @@ class CapstoneConfig:
 
 def course_draws(seed: int, scenario: simulation.Scenario, landmarks: int) -> simulation.Draws:
     """Standard normals in the order in which the course's program asks for them: a step's heading, speed and yaw
-    rate, range and bearing of each landmark when the detector looks, then the beams.
+    rate, range and bearing of each landmark when the detector is active, then the beams.
     """
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed: expected 0 to 2³² - 1, as NumPy's RandomState has it, got {seed}")
     generator = np.random.RandomState(seed)
-    drive, sighting, scan = [], [], []
+    drive, detection, scan = [], [], []
     for k in range(scenario.steps):
         drive.append(generator.standard_normal(3))
-        looks = k % scenario.sight_period == 0
-        sighting.append(generator.standard_normal((landmarks, 2)) if looks else np.zeros((landmarks, 2)))
+        active = k % scenario.detector.period == 0
+        detection.append(generator.standard_normal((landmarks, 2)) if active else np.zeros((landmarks, 2)))
         scan.append(generator.standard_normal(scenario.beams))
-    return simulation.Draws(*(jnp.asarray(np.array(numbers)) for numbers in (drive, sighting, scan)))
+    return simulation.Draws(*(jnp.asarray(np.array(numbers)) for numbers in (drive, detection, scan)))
 
 
 def course_drive(seed: int, scenario: simulation.Scenario, world: simulation.World) -> tuple[Truth, Inputs]:
@@ -49,9 +49,10 @@ def course_drive(seed: int, scenario: simulation.Scenario, world: simulation.Wor
     and not, as ours does, when the landmark is. With seed 4 that makes a difference at two of its 133 observations.
     """
     draws = course_draws(seed, scenario, len(world.landmarks))
-    everything = dataclasses.replace(scenario, sight_range=math.inf)
+    detector = dataclasses.replace(scenario.detector, max_range=math.inf)
+    everything = dataclasses.replace(scenario, detector=detector)
     truth, inputs = simulation.roll_out(draws, world, simulation.Noise(), scenario.prior().mean, scenario=everything)
-    return truth, inputs._replace(valid=inputs.valid & (inputs.z[..., 0] < scenario.sight_range))
+    return truth, inputs._replace(valid=inputs.valid & (inputs.z[..., 0] < scenario.detector.max_range))
 
 
 def main(config: CapstoneConfig) -> dict[str, Any]:
@@ -72,10 +73,10 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
         )
         error = jax.vmap(consistency.pose_error)(truth.pose, info.belief.mean)
         nees = jax.vmap(consistency.nees)(error, info.belief.cov)
-        log_odds = state.log_odds
-        assert log_odds is not None  # the scenario has a grid
+        log_odds, spec = state.log_odds, settings.grid
+        assert log_odds is not None and spec is not None  # the scenario has a grid
         occupancy = grid.probability(log_odds)
-        occupied = simulation.occupancy(world, scenario.grid)
+        occupied = simulation.occupancy(world, spec)
         report = {
             "steps": scenario.steps,
             "seed": config.seed,
@@ -89,8 +90,8 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
             "occupancy_min": float(occupancy.min()),
             "occupancy_max": float(occupancy.max()),
             "occupancy_mean": float(occupancy.mean()),
-            "map_entropy_bits": float(grid.entropy_bits(log_odds)),
-            "map_brier": float(grid.brier(log_odds, occupied, log_odds != 0)),
+            "map_entropy_bits": float(quality.entropy_bits(log_odds)),
+            "map_brier": float(quality.brier(log_odds, occupied, log_odds != 0)),
         }
     write_report(out, report)
     estimate, walls = np.asarray(info.belief.mean), np.asarray(world.segments)
@@ -106,7 +107,7 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
     plotting.map_figure(
         out / "map.png",
         np.asarray(log_odds),
-        scenario.grid,
+        spec,
         estimate,
         truth=np.asarray(truth.pose),
         segments=walls,

@@ -93,7 +93,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         "motion": config.motion,
         "prior": "exact" if scenario.exact_prior else "drawn",
         **summarise(totals.value, settings, _reference(scenario, settings, config, runs)),
-        "params": {name: np.asarray(value).tolist() for name, value in params._asdict().items()},
+        "params": params.numbers(),
         "seed": config.seed,
         **how_computed(totals, runs, began),
     }

@@ -101,7 +101,7 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
         info = filter_log(params, prior, timeline.inputs, log.landmarks, settings)
         report = judge(log, timeline, info, settings)
     report["careful"] = said
-    report["params"] = {name: np.asarray(value).tolist() for name, value in params._asdict().items()}
+    report["params"] = params.numbers()
     _write(out, log, timeline, info, report)
     return report
 

@@ -17,7 +17,6 @@ from common import CONSOLE, command_line, count_rows, output_folder, params_or, 
 
 from jaxlocmap import Config, GridSpec, Params, map_scans, plotting
 from jaxlocmap.logs import Log, read
-from jaxlocmap.mapping import grid
 from jaxlocmap.mapping.ros import FREE, OCCUPIED, save_map
 from jaxlocmap.simulation import course_params
 from jaxlocmap.step import map_spec
@@ -88,7 +87,7 @@ def main(config: MapLogConfig) -> dict[str, Any]:
         "seen": int(np.sum(log_odds != 0)),
         "occupied": int(np.sum(cells == OCCUPIED)),
         "free": int(np.sum(cells == FREE)),
-        "entropy_bits": float(grid.entropy_bits(jnp.asarray(log_odds))),
+        "entropy_bits": float(quality.entropy_bits(jnp.asarray(log_odds))),
         "counts": log.counts,
         "mapping_s": seconds,
         "compile_s": compile_s,

@@ -17,13 +17,13 @@ import numpy as np
 from common import CONSOLE, ComputeConfig, command_line, output_folder, progress_bar, saved, start, write_report
 from rich.table import Table
 
-from jaxlocmap import Config, Gaussian, Inputs, Params, consistency, init, plotting, run, simulation
-from jaxlocmap import sensors as sensor
+from jaxlocmap import Config, Gaussian, Inputs, Params, State, consistency, init, plotting, run, sensors, simulation
 from jaxlocmap._internal.batching import any_in_batch
-from jaxlocmap._internal.linalg import Matrix, is_psd, ldl, solve
+from jaxlocmap._internal.linalg import Matrix, ldl, solve
 from jaxlocmap.filters import ekf
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.motion import resolve
+from jaxlocmap.parameters import R
+from jaxlocmap.step import Observed, turn
 
 BINS = 40  # of time, for the figure
 _FILTERS = ("float64", "float32", "short_form")  # the last in float32 as well
@@ -88,7 +88,7 @@ class Precision:
     ) -> Outcome:
         """Scores of the drive that `key` stands for; all arguments in float64."""
         start_key, key = jax.random.split(key)
-        first = prior.mean if self.scenario.exact_prior else simulation.draw_pose(start_key, prior)
+        first = prior.mean if self.scenario.exact_prior else simulation.draw_state(start_key, prior)
         drive = simulation.simulate(key, world, noise, first, scenario=self.scenario, scan=False)
         # Bin by bin, so that no filter's beliefs are kept for the whole drive.
         drive = jax.tree.map(lambda x: x.reshape(BINS, -1, *x.shape[1:]), drive)
@@ -100,7 +100,7 @@ class Precision:
             double, (exact, exact_ok) = run(params, double, inputs, **scene)
             single, (rounded, rounded_ok) = run(params, single, in_single(inputs), **scene)
             short, (brief, brief_ok) = short_form_run(
-                *in_single((params, short, inputs, world.landmarks)), config=self.config
+                in_single(params), short, *in_single((inputs, world.landmarks)), config=self.config
             )
             return (double, single, short), Outcome(
                 double=_score(truth.pose, exact, exact_ok),
@@ -111,7 +111,7 @@ class Precision:
             )
 
         rounded = in_single(prior)
-        states = (init(prior, config=self.config), init(rounded, config=self.config), rounded)
+        states = (init(prior, config=self.config), *(init(rounded, config=self.config) for _ in range(2)))
         return jax.lax.scan(one_bin, states, drive)[1]
 
 
@@ -121,34 +121,38 @@ def in_single(tree: Any) -> Any:
 
 
 def short_form_run(
-    params: Params, belief: Gaussian, inputs: Inputs, landmarks: jax.Array, *, config: Config
-) -> tuple[Gaussian, tuple[Gaussian, jax.Array]]:
+    params: Params, state: State, inputs: Inputs, landmarks: jax.Array, *, config: Config
+) -> tuple[State, tuple[Gaussian, jax.Array]]:
     """`run` without gate and map, with P ← (I − K H) P in place of Joseph's form.
 
     The short form is exact for the optimal gain K, and only for that one: a rounded gain can cost P its definiteness.
 
     Returns:
-        The last belief, and the belief after every step with whether its covariance is one, up to rounding.
+        The last state, and the belief after every step with whether it is valid.
     """
 
     def slot(belief: Gaussian, now: tuple[jax.Array, ...]) -> tuple[Gaussian, None]:
         z, landmark, valid = now
-        residual, H, _ = sensor.linearise(belief.mean, landmarks[landmark], z, config.sensor_offset)
-        update = ekf.update(*belief, residual, H, params.R, valid=valid)
+        residual, H, _ = sensors.linearise(belief.mean, landmarks[landmark], z, offset=config.sensor_offset)
+        update = ekf.update(*belief, residual, H, params.block(R), valid=valid)
         P, (L, D) = Matrix.symmetric(belief.cov), ldl(Matrix.symmetric(update.S))
         K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)
         short = ((Matrix.identity(3) - K @ H) @ P).array(z.dtype)
         return Gaussian(update.mean, jnp.where(update.accepted, short, belief.cov)), None
 
-    def body(belief: Gaussian, now: Inputs) -> tuple[Gaussian, tuple[Gaussian, jax.Array]]:
-        motion = resolve(config.motion)
-        belief = Gaussian(*ekf.predict(*belief, now.control, now.dt, params.Q, motion=motion, nominal_dt=config.dt))
-        slots = (now.z, now.landmark, now.valid)
-        correct = lambda: jax.lax.scan(slot, belief, slots)[0]  # noqa: E731
-        belief = jax.lax.cond(any_in_batch(now.valid), correct, lambda: belief)
-        return belief, (belief, is_psd(Matrix.symmetric(belief.cov)))
+    def body(state: State, now: Inputs) -> tuple[State, tuple[Gaussian, jax.Array]]:
+        def observe(belief: Gaussian) -> Observed:
+            slots = now.z, now.landmark, now.valid
+            correct = lambda: jax.lax.scan(slot, belief, slots)[0]  # noqa: E731
+            corrected = jax.lax.cond(any_in_batch(now.valid), correct, lambda: belief)
+            return Observed(corrected, None, jnp.zeros((), belief.mean.dtype), jnp.array(True))
 
-    return jax.lax.scan(body, belief, inputs)
+        state, _, ok = turn(
+            params, state, now.control, now.dt, observe=observe, ranges=None, beam_angles=None, config=config
+        )
+        return state, (state.belief, ok)
+
+    return jax.lax.scan(body, state, inputs)
 
 
 def _beliefs(state: Any, info: Any, aside: Any) -> tuple[Gaussian, jax.Array]:
@@ -239,7 +243,7 @@ def _row(seed: int, steps: int, runs: int, sharper: float, progress: Any) -> dic
     noise = noise._replace(range=noise.range / sharper, bearing=noise.bearing / sharper)
     settings = scenario.config(motion="euler", gate_probability=None, grid=False)
     study = Precision(scenario, settings)
-    arguments = (simulation.own_params(noise, scenario.dt), simulation.room(), noise, scenario.prior())
+    arguments = (simulation.own_params(noise, scenario), simulation.room(), noise, scenario.prior())
     result = monte_carlo(study, jax.random.key(seed), runs, *arguments, keep_runs=True, progress=progress)
     return summarise(result.value, scenario, sharper)
 

@@ -70,7 +70,7 @@ def main(config: TablesConfig) -> dict[str, str]:
 
 def _studies(config: TablesConfig, out: Path) -> str:
     plant = out / "plant.json"
-    simulation.own_params(simulation.Noise(), simulation.CAPSTONE.dt).save(plant)
+    simulation.own_params(simulation.Noise(), simulation.CAPSTONE).save(plant)
     rows = ["| the filter believes | arguments | ANEES (3) | x, y, yaw alone (1) | NIS (2) | gate lets in | verdict |"]
     rows.append("|---" * 7 + "|")
     for i, (what, arguments, settings) in enumerate(_STUDIES):

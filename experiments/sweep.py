@@ -47,7 +47,6 @@ class Cell(NamedTuple):
 
     params: Params
     noise: simulation.Noise
-    gate_probability: jax.Array | None = None  # None: the study's own
 
 
 class Swept(NamedTuple):
@@ -92,15 +91,15 @@ SWEPT = {
     "sigma_range": _scale("deviation of the range", "σ_range", _SCALES**0.5, "R", 0),
     "sigma_bearing": _scale("deviation of the bearing", "σ_bearing", _SCALES**0.5, "R", 1),
     "gate_probability": Swept(
-        "gate: share of good sightings it should let in [–], 1 is no gate",
+        "gate: share of good observations it should let in [–], 1 is no gate",
         "gate {}",
         (0.5, 0.8, 0.9, 0.95, 0.99, 0.999, 0.9999, 0.99999, 1.0),
         "a probability in (0, 1]",
         lambda value: 0 < value <= 1,
-        lambda cell, value: cell._replace(gate_probability=value),
+        lambda cell, value: cell._replace(params=cell.params._replace(gate_probability=value)),
     ),
     "outlier_rate": Swept(
-        "share of sightings that are false [–]",
+        "share of observations that are false [–]",
         "outlier rate {}",
         (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5),
         "a share in [0, 1]",
@@ -168,7 +167,7 @@ class SweepStudy:
 
         def cell(x: jax.Array, y: jax.Array) -> Totals:
             here = SWEPT[self.y].enter(SWEPT[self.x].enter(Cell(params, noise), x), y)
-            return self.study(key, here.params, world, here.noise, prior, here.gate_probability, **how)
+            return self.study(key, here.params, world, here.noise, prior, **how)
 
         # The random numbers do not depend on the cell, so they are drawn once for all of them.
         row = jax.vmap(cell, in_axes=(0, None))
@@ -189,10 +188,11 @@ def main(config: SweepConfig) -> dict[str, Any]:
         raise ValueError(f"runs: expected at least 2, which a band needs, got {config.runs}")
     runs = min(config.runs, 50) if config.quick else config.runs
     start(config.compute)
-    scenario = dataclasses.replace(scenario, outliers="outlier_rate" in (config.x, config.y))
+    detector = dataclasses.replace(scenario.detector, outliers="outlier_rate" in (config.x, config.y))
+    scenario = dataclasses.replace(scenario, detector=detector)
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=False)
     noise = simulation.Noise()
-    params = params_or(config.params, simulation.own_params(noise, scenario.dt))
+    params = params_or(config.params, simulation.own_params(noise, scenario))
     named = {name: getattr(config, name) for name in ("x", "y", "scenario", "motion", "gate", "seed")}
     parts = study_parts(out, config.compute, named)
     CONSOLE.print(f"{len(x)} x {len(y)} cells, {runs} runs of {scenario.name} in each, {scenario.steps} steps")
@@ -214,7 +214,7 @@ def main(config: SweepConfig) -> dict[str, Any]:
         "steps": scenario.steps,
         "runs": runs,
         "motion": config.motion,
-        "params": {name: np.asarray(value).tolist() for name, value in params._asdict().items()},
+        "params": params.numbers(),
         "gate_probability": config.gate,
         "verdict": verdict(config.x, config.y, cells),
         "consistent_cells": sum(cell["consistent"] for cell in cells),

@@ -24,9 +24,9 @@ from jaxlocmap.monte_carlo import hosts
 
 _STEPS = {"lbfgs": 2, "adam": 20}  # an epoch
 _LOSS_WORDS = {
-    "innovation": "negative log-likelihood of an innovation, nats",
-    "pose": "negative log density of the true pose, nats",
-    "state": "squared error of the pose, m²",
+    "innovation_nll": "negative log-likelihood of an innovation, nats",
+    "pose_nll": "negative log density of the true pose, nats",
+    "mse": "squared error of the pose, m²",
     "nees": "distance of the NEES from χ(3)",
     "nis": "distance of the NIS from χ(2)",
     "map": "log-loss of the next scan's cells, nats",
@@ -65,7 +65,7 @@ def _tune(config: TuneConfig, out: Path, kept: list[str]) -> dict[str, Any]:
         write_report(out, descent)
         kept.append(f"{kept[-1]}, and the descent in {out / 'report.json'}")
         CONSOLE.print("judging what was held out, before and after; standard errors")
-        sure = tuning.certainty(objective, found.params, source.compared, tuned)
+        sure = tuning.standard_errors(objective, found.params, source.compared, tuned)
         report = {
             **descent,
             "parameters": _parameters(source.start, found.params, sure),
@@ -133,7 +133,7 @@ def _bar(epochs: int, tuned: tuple[str, ...], out: Path, kept: list[str]) -> Ite
         yield move
 
 
-def _parameters(start: Params, end: Params, sure: tuning.Certainty) -> dict[str, dict[str, Any]]:
+def _parameters(start: Params, end: Params, sure: tuning.StandardErrors) -> dict[str, dict[str, Any]]:
     before, after = tuning.natural(start), tuning.natural(end)
     return {
         name: {

@@ -25,15 +25,16 @@ import numpy as np
 import scipy.optimize
 from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
 from jax.flatten_util import ravel_pytree
-from tune_sources import GATE_SOFTNESS, TUNING_GATE
+from tune_sources import GATE_TEMPERATURE, TUNING_GATE
 
 from jaxlocmap import Config, Gaussian, Inputs, Params, consistency, simulation, tuning
 from jaxlocmap.consistency import readable
 from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.monte_carlo import hosts, monte_carlo
+from jaxlocmap.parameters import Q, R
 
 _CLOSE = 1e-4  # nats: two losses this close are the same, a tenth of what 512 runs leave uncertain
-_LOSSES = ("state", "pose", "innovation", "nees", "nis")
+_LOSSES = ("mse", "pose_nll", "innovation_nll", "nees", "nis")
 _TWO = ("range", "bearing")  # what `nees` and `nis` are tuned by, which tell no more than two
 _SURE = 1 / 3  # of the robot's own deviations: where the second comparison starts
 _STEADY = simulation.LOOP  # whose prior is honest: an exact start would let a filter win that does not look
@@ -119,8 +120,8 @@ def _drives(scenario: simulation.Scenario, runs: int, seed: int) -> tuning.Batch
 
 def _optimisers(runs: int, judge: Callable[[Params], dict[str, Any]], config: CompareConfig) -> list[dict[str, Any]]:
     settings = simulation.CAPSTONE.config(motion="euler", gate_probability=TUNING_GATE, grid=False)
-    settings = dataclasses.replace(settings, gate_softness=GATE_SOFTNESS)
-    objective = tuning.Objective(settings, (("innovation", 1.0),))
+    settings = dataclasses.replace(settings, gate_temperature=GATE_TEMPERATURE)
+    objective = tuning.Objective(settings, (("innovation_nll", 1.0),))
     start, batch = simulation.course_params(), _drives(simulation.CAPSTONE, runs, config.seed)
     ways = {
         "this library: L-BFGS, forward gradient": lambda: _ours(objective, start, batch, config.quick),
@@ -199,8 +200,8 @@ def _scipy(
 def _losses(runs: int, judge: Callable[[Params], dict[str, Any]], config: CompareConfig) -> list[dict[str, Any]]:
     settings = _STEADY.config(motion="euler", gate_probability=None, grid=False)
     batch = _drives(_STEADY, runs, config.seed)
-    own = simulation.own_params(simulation.Noise(), simulation.CAPSTONE.dt)
-    start = own._replace(Q=own.Q * _SURE**2, R=own.R * _SURE**2)
+    own = simulation.own_params(simulation.Noise(), simulation.CAPSTONE)
+    start = own._replace(Q=own.block(Q) * _SURE**2, R=own.block(R) * _SURE**2)
     rows = [_loss_row("the start", start, judge), _loss_row("the robot's own noise", own, judge)]
     losses = _LOSSES[:1] if config.quick else _LOSSES
     with progress_bar("losses", len(losses)) as progress:
@@ -223,7 +224,7 @@ def _loss_row(name: str, params: Params, judge: Callable[[Params], dict[str, Any
 
 def _cost(runs: int, quick: bool) -> dict[str, float]:
     filter_only = tuning.Objective(
-        simulation.CAPSTONE.config(motion="euler", gate_probability=TUNING_GATE, grid=False), (("innovation", 1.0),)
+        simulation.CAPSTONE.config(motion="euler", gate_probability=TUNING_GATE, grid=False), (("innovation_nll", 1.0),)
     )
     start, batch = simulation.course_params(), _drives(simulation.CAPSTONE, runs, 0)
     whole = tuning.unconstrain(start)
@@ -255,7 +256,7 @@ def _bytes_a_run(steps: int, runs: int = 4) -> float:
     scenario = dataclasses.replace(simulation.CAPSTONE, steps=steps)
     world, noise = simulation.room(), simulation.Noise()
     settings = scenario.config(motion="euler", gate_probability=TUNING_GATE)
-    objective = tuning.Objective(settings, (("innovation", 1.0), ("map", 1.0)))
+    objective = tuning.Objective(settings, (("innovation_nll", 1.0), ("map", 1.0)))
     batch = jax.eval_shape(
         lambda key: tuning.simulated(key, runs, world, noise, scenario=scenario, scans=True), jax.random.key(0)
     )
@@ -281,7 +282,7 @@ def _linear(config: CompareConfig) -> list[dict[str, Any]]:
     settings = Config(dt=_DT, motion="euler", gate_probability=None)
     start = Params.from_std(v=0.1, w=0.1, range=0.1, bearing=0.1)
     rows = [_linear_row("the start", start, 0.0, test, settings)]
-    for loss in ("state",) if config.quick else ("state", "pose", "innovation"):
+    for loss in ("mse",) if config.quick else ("mse", "pose_nll", "innovation_nll"):
         objective = tuning.Objective(settings, ((loss, 1.0),))
         fit = tuning.fit(objective, start, train, tuned=tuning.FULL_NOISE, epochs=2 if config.quick else 20)
         rows.append(_linear_row(f"this library, `{loss}`", fit.params, fit.run_s, test, settings))

@@ -28,8 +28,8 @@ class TuneConfig:
     """Which robots of an mrclam log to tune on, by default 1 2 3."""
     judged: tuple[int, ...] | None = None
     """Which robots of an mrclam log to judge the result by, by default 4 5."""
-    loss: tuple[str, ...] = ("innovation",)
-    """innovation, pose, state, nees, nis, map; several with weights: pose=1 nees=0.5."""
+    loss: tuple[str, ...] = ("innovation_nll",)
+    """innovation_nll, pose_nll, mse, nees, nis, map; several with weights: pose_nll=1 nees=0.5."""
     tune: tuple[str, ...] | None = None
     """Which of v, w, v_w, range, bearing, range_bearing, l_occ, l_free; by default what the losses depend on, with Q
     and R diagonal."""
@@ -96,6 +96,7 @@ _DEFAULTS = {
 }
 _QUICK = {"epochs": 2, "runs": 32, "judge_runs": 100}
 _LASER_RANGE = 20.0  # m
+_RENAMED = {"innovation": "innovation_nll", "pose": "pose_nll", "state": "mse"}  # the losses' former names
 _DEPENDS = {"map": tuning.SENSOR_MODEL}
 
 
@@ -175,6 +176,7 @@ def loss_weights(config: TuneConfig) -> tuple[tuple[str, float], ...]:
             value = float(weight if given else 1)
         except ValueError:
             raise ValueError(f"loss: expected NAME or NAME=WEIGHT, got {loss!r}") from None
+        name = _RENAMED.get(name, name)
         if name not in tuning.LOSSES:
             raise ValueError(f"loss: expected one of {', '.join(sorted(tuning.LOSSES))}, got {name!r}")
         if name in weights or not 0 < value < math.inf:

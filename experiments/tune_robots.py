@@ -75,10 +75,10 @@ def _jobs(config: RobotsConfig) -> Iterator[tuple[str, str, Any]]:
         return Wanted((loss,), None, TUNING_GATE, JUDGE_GATE, config.seed, config.quick)
 
     woods, mrclam = config.data / "lost_in_the_woods" / "dataset2.mat", config.data / "mrclam" / "MRCLAM_Dataset6"
-    for loss in ("pose",) if config.quick else ("innovation", "state", "nees", "pose"):
+    for loss in ("pose_nll",) if config.quick else ("innovation_nll", "mse", "nees", "pose_nll"):
         yield "woods", loss, lambda loss=loss: from_robots(woods, "woods", (), (), "euler", 5.0, wanted(loss))
     splits = list(itertools.combinations(_ROBOTS, 3))[: config.splits]
-    for loss in () if config.quick else ("innovation", "pose"):
+    for loss in () if config.quick else ("innovation_nll", "pose_nll"):
         for tuned in splits:
             judged = tuple(robot for robot in _ROBOTS if robot not in tuned)
             name = f"mrclam {', '.join(map(str, judged))}"

@@ -18,14 +18,14 @@ from map_log import first_scans, ready, say_doubts
 from jaxlocmap import Config, Gaussian, Params, simulation, tuning
 from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline
-from jaxlocmap.mapping.predictive import Foresight
+from jaxlocmap.mapping.predictive import PredictiveScore
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.simulation.world import random_room
 
 Evidence = dict[str, Any]
 TUNING_GATE, JUDGE_GATE = 0.9999, 0.99
 _LOST_STD = (1.0, 1.0, 0.5)  # m, m, rad: how far off a window may start where no truth is known
-GATE_SOFTNESS = 2.0  # while tuning, of the squared distance; the gate itself is at 18.4, for a probability of 0.9999
+GATE_TEMPERATURE = 2.0  # while tuning, of the squared distance; the gate itself is at 18.4, for a probability of 0.9999
 _HELD_OUT_WORLDS = 64
 _BLOCKS = 10  # of the scans of one map, for its standard errors
 
@@ -85,12 +85,12 @@ def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wa
         totals = monte_carlo(Study(scenario, study_config), jax.random.fold_in(key, 3), study_runs, *args)
         report = summarise(totals.value, study_config)
         if held_out is not None:
-            report["one_scan_ahead"] = _foresight(params, held_out, study_config)
+            report["one_scan_ahead"] = _predictive_score(params, held_out, study_config)
         return report
 
     train = drives(0, runs)
     # Where only the map is tuned the simulated robot knows its own noise: the map is to be judged, not the pose.
-    own = simulation.own_params(noise, scenario.dt)
+    own = simulation.own_params(noise, scenario)
     start = simulation.course_params()
     if wanted.losses == ("map",):
         start = own._replace(l_occ=start.l_occ, l_free=start.l_free)
@@ -171,14 +171,14 @@ def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) 
         train,
         validation,
         tuning.blocks(train, min(_BLOCKS, half // 2)),
-        lambda params: {"one_scan_ahead": _foresight(params, later, config)},
+        lambda params: {"one_scan_ahead": _predictive_score(params, later, config)},
         1.0,
     )
 
 
 def _tuning(config: Config) -> Config:
     """The filter's settings with a gate that weighs instead of deciding, so that gradients see what it does."""
-    return dataclasses.replace(config, gate_softness=GATE_SOFTNESS)
+    return dataclasses.replace(config, gate_temperature=GATE_TEMPERATURE)
 
 
 def _scans(log: Log, count: int) -> tuning.Batch:
@@ -235,16 +235,16 @@ def _judged(params: Params, log: Log, timeline: Timeline, config: Config) -> Evi
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _foreseen(params: Params, batch: tuning.Batch, *, config: Config) -> Foresight:
+def _predictive_sums(params: Params, batch: tuning.Batch, *, config: Config) -> PredictiveScore:
     """The sums over all drives, mapped where the batch says or else where the filter is."""
     poses = batch.poses if batch.poses is not None else tuning.beliefs(params, batch, config=config).mean
-    each = tuning.foreseen(params.l_occ, params.l_free, batch, poses, config=config, bins=True)
+    each = tuning.predictive_score(params.l_occ, params.l_free, batch, poses, config=config, bins=True)
     return jax.tree.map(lambda x: jnp.sum(x, axis=0), each)
 
 
-def _foresight(params: Params, batch: tuning.Batch, config: Config) -> Evidence:
+def _predictive_score(params: Params, batch: tuning.Batch, config: Config) -> Evidence:
     """Log-loss and calibration one scan ahead."""
-    sums = jax.tree.map(lambda x: np.asarray(x, np.float64), _foreseen(params, batch, config=config))
+    sums = jax.tree.map(lambda x: np.asarray(x, np.float64), _predictive_sums(params, batch, config=config))
     some = np.maximum(sums.bin_cells, 1)
     return {
         "log_loss": float(sums.log_loss / sums.cells),

@@ -21,6 +21,7 @@ from jaxlocmap.consistency.scoring import Totals
 from jaxlocmap.consistency.study import pose_means, reference_study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.monte_carlo.hosts import check_count, merge_kernels, use_all_cores
+from jaxlocmap.se2 import POSE
 
 SCALES = (0.5, 0.8, 1.25, 2.0)  # of the covariance
 _REFERENCE_RUNS = 2000
@@ -135,7 +136,7 @@ def _factor_intervals(found: list[Totals], references: list[Totals], settings: A
                 relative = consistency.ratio(nees, pose_means(references[n], settings).nees)
                 low, high = relative.interval_95
             else:
-                low, high = (limit / consistency.POSE_DIMENSION for limit in nees.interval_95)
+                low, high = (limit / POSE for limit in nees.interval_95)
             inside += low <= 1 / scale <= high
         held[f"{scale:g}"] = inside / len(found)
     return held
@@ -177,7 +178,7 @@ class Single:
         """The true poses (T, 3) and the beliefs of the run that `key` stands for."""
         config = self.scenario.config(motion="euler", gate_probability=None, grid=False)
         start_key, key = jax.random.split(key)
-        start = prior.mean if self.scenario.exact_prior else simulation.draw_pose(start_key, prior)
+        start = prior.mean if self.scenario.exact_prior else simulation.draw_state(start_key, prior)
         truth, inputs = simulation.simulate(key, world, noise, start, scenario=self.scenario, scan=False)
         state = init(prior, config=config)
         beliefs = run(params, state, inputs, landmarks=world.landmarks, config=config, collect=_belief)[1]
@@ -192,7 +193,7 @@ def _belief(state: Any, info: Any, aside: Any) -> Gaussian:
 def _single_runs(key: jax.Array, scenario: simulation.Scenario, count: int) -> dict[str, Any]:
     """Single runs of an honest filter, each judged alone."""
     noise = simulation.Noise()
-    args = simulation.own_params(noise, scenario.dt), simulation.room(), noise, scenario.prior()
+    args = simulation.own_params(noise, scenario), simulation.room(), noise, scenario.prior()
     held, verdicts, samples, mean = 0, [], [], []
     with progress_bar(f"single runs of {scenario.name}", count) as progress:
         for n in range(count):

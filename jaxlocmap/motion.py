@@ -1,35 +1,59 @@
-"""Motion models of a differential drive: a transition and its Jacobians.
+"""Motion models: a transition and its Jacobians. Those of a differential drive are here.
 
-A pose is (x, y, theta), a control (v, omega) in the body frame. To bring your own model, write the transition and
-call `from_transition`.
+A pose is (x, y, theta), a control (v, omega) in the body frame. To bring your own model, of any state that begins with
+a pose, write the transition and call `from_transition`.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxlocmap import checks
 from jaxlocmap._internal.linalg import Matrix
 from jaxlocmap._internal.trig import sin_cos
+from jaxlocmap.parameters import Block, Q
+from jaxlocmap.se2 import HEADING, POSE, wrap
 
 
 class MotionModel(NamedTuple):
-    """How a control moves a pose. Two functions, so a model is hashable and static under jit.
+    """How a control moves a state whose first three entries are the robot's pose. Functions and names, so a model is
+    hashable and static under jit.
 
-    Those of this module raise ValueError for anything but one pose, control and step length; a batch is a `vmap`.
+    Noise enters as an error of the input u: the control, followed by as many zeros as the blocks of `noise` have
+    components more. Those are what drives the rest of the state and nobody measures, such as the rate of a drifting
+    bias. The models of this module raise ValueError for anything but one pose, control and step length; a batch is a
+    `vmap`.
     """
 
-    transition: Callable[..., Any]  # (pose (3,), control (2,), dt) -> pose (3,), heading wrapped
-    jacobians: Callable[..., Any]  # same arguments -> F = df/dpose (3, 3), G = df/dcontrol (3, 2)
+    transition: Callable[..., Any]  # (state (n,), u (q,), dt () s) -> state (n,), angles wrapped
+    jacobians: Callable[..., Any]  # same arguments -> F = df/dstate (n, n), G = df/du (n, q)
+    dim: int = POSE  # n
+    angles: tuple[int, ...] = HEADING  # entries of the state that are angles
+    noise: tuple[Block, ...] = (Q,)  # of u over one nominal period, q components in all
 
+    @property
+    def inputs(self) -> int:
+        """The length q of u."""
+        return sum(len(block.components) for block in self.noise)
 
-def wrap(angle: jax.Array) -> jax.Array:
-    """The angle in [-pi, pi), to rounding; inside, all but the last below pi come back bit for bit. Derivative 1."""
-    return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) * (0.5 / jnp.pi))
+    def full_input(self, control: jax.Array) -> jax.Array:
+        """The control, followed by zeros: u (q,).
+
+        Raises:
+            ValueError: a control that ends within a block of the noise, or has more entries than all of them.
+        """
+        ends = list(itertools.accumulate(len(block.components) for block in self.noise))
+        if np.ndim(control) != 1 or len(control) not in ends:
+            wanted = " or ".join(f"({end},)" for end in ends)
+            raise ValueError(f"control: expected shape {wanted}, as the motion model takes, got {np.shape(control)}")
+        rest = self.inputs - len(control)
+        return jnp.concatenate([control, jnp.zeros(rest, control.dtype)]) if rest else control
 
 
 def _sinc(h: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -106,24 +130,40 @@ CAPSTONE = MotionModel(_arc_transition, _euler_jacobians)
 MODELS = {"euler": EULER, "arc": ARC, "capstone": CAPSTONE}
 
 
-def from_transition(transition: Callable[..., jax.Array]) -> MotionModel:
+def from_transition(
+    transition: Callable[..., jax.Array],
+    *,
+    dim: int = POSE,
+    angles: tuple[int, ...] = HEADING,
+    noise: tuple[Block, ...] = (Q,),
+) -> MotionModel:
     """A model from its transition alone; the Jacobians come from forward-mode differentiation.
 
     Args:
-        transition: `(pose (3,) m, m, rad; control (2,) m/s, rad/s; dt () s) -> pose (3,)`, differentiable, heading
-            wrapped with `motion.wrap`. Make the model once and keep it: a new one is a new program to compile.
+        transition: `(state (n,), u (q,), dt () s) -> state (n,)`, differentiable, angles wrapped with `se2.wrap`; the
+            first three entries of the state are the pose in m, m, rad. Make the model once and keep it: a new one is
+            a new program to compile.
+        dim: n.
+        angles: entries of the state that are angles; the heading, 2, is one.
+        noise: the blocks of `Params` that u = (v, omega, ...) has the noise of, q components in all.
 
     Returns:
         A model that raises ValueError where an argument, or what the transition makes of them, is of another shape.
-    """
 
-    def checked(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.Array:
-        _check(pose, control, dt)
-        moved = transition(pose, control, dt)
-        checks.shape("transition(pose, control, dt)", moved, (3,))
+    Raises:
+        ValueError: a state without a pose, or angles that are none of its entries.
+    """
+    if dim < POSE or not set(HEADING) <= set(angles) <= set(range(dim)):
+        raise ValueError(f"dim, angles: expected a pose, its heading {HEADING[0]} an angle, got {dim} and {angles}")
+    inputs = sum(len(block.components) for block in noise)
+
+    def checked(state: jax.Array, u: jax.Array, dt: jax.Array) -> jax.Array:
+        checks.shapes(state=(state, (dim,)), u=(u, (inputs,)), dt=(dt, ()))
+        moved = transition(state, u, dt)
+        checks.shape("transition(state, u, dt)", moved, (dim,))
         return moved
 
-    return MotionModel(checked, jax.jacfwd(checked, argnums=(0, 1)))
+    return MotionModel(checked, jax.jacfwd(checked, argnums=(0, 1)), dim, tuple(angles), tuple(noise))
 
 
 def resolve(model: str | MotionModel) -> MotionModel:

@@ -1,7 +1,7 @@
-"""The loop: predict the pose, correct it, put the scan into the map. The only scans over time.
+"""The scans over time: `step` is one turn over what was recorded, `run` scans it, `map_scans` is the map's part alone.
 
-`step` is one turn, `run` scans it, `map_scans` is the map's half alone. All are pure; `jit`, `vmap`, `grad` and
-`shard_map` apply as they are, and no value of `params`, `inputs` or `landmarks` is ever compiled in.
+All are pure; `jit`, `vmap`, `grad` and `shard_map` apply as they are, and no value of `params`, `inputs` or `landmarks`
+is ever compiled in.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import checks
-from jaxlocmap import sensors as sensor
-from jaxlocmap._internal.batching import any_in_batch, cond, scan, zero_like_any
+from jaxlocmap import checks, motion, sensors
+from jaxlocmap._internal.batching import any_in_batch, cond, scan
 from jaxlocmap.mapping import grid
-from jaxlocmap.step import Sighting, correct, is_measurement, map_scan, map_spec, predict, sound
+from jaxlocmap.se2 import POSE
+from jaxlocmap.step import Observation, Observed, clamp_map, correct, map_scan, map_spec, turn
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
 
 # rad², of a heading that is uniform on the circle.
@@ -28,23 +28,26 @@ def init(prior: Gaussian, *, config: Config) -> State:
     """The state before the first step: the prior is the pose at step -1, and the map knows nothing.
 
     Args:
-        prior: mean (3,) m, m, rad; cov (3, 3). Its dtype is the dtype of everything that follows.
+        prior: mean (n,), cov (n, n) of the state of the motion model, which begins with the pose in m, m, rad. Its
+            dtype is the dtype of everything that follows.
         config: `config.grid` None leaves out the map.
 
     Raises:
-        ValueError: wrong shapes; a grid so far out that the dtype cannot hold its corners to a millimetre; or, when
-            they can be looked at, a mean that is not finite or as far out, a covariance that is not positive
-            semi-definite, or in float32 a heading variance above π²/3 rad², that of a heading nobody knows.
+        ValueError: wrong shapes; an unknown motion model; a grid so far out that the dtype cannot hold its corners to a
+            millimetre; or, when they can be looked at, a mean that is not finite or as far out, a covariance that is
+            not positive semi-definite, or in float32 a heading variance above π²/3 rad², that of a heading nobody
+            knows.
         TypeError: a prior that is not floating point.
     """
     mean, cov = (jnp.asarray(x) for x in prior)
-    checks.shape("prior.mean", mean, (3,))
+    n = motion.resolve(config.motion).dim
+    checks.shape("prior.mean", mean, (n,))
     for name, value in (("mean", mean), ("cov", cov)):
         checks.dtype(f"prior.{name}", value, np.floating)
     if checks.is_concrete(mean) and not np.all(np.isfinite(mean)):
-        raise ValueError(f"prior.mean: expected finite x, y, theta, got {mean.tolist()}")
+        raise ValueError(f"prior.mean: expected finite x, y, theta{', ...' * (n > POSE)}, got {mean.tolist()}")
     checks.resolved("prior.mean", mean[:2], mean.dtype)
-    checks.covariance("prior.cov", cov, 3)
+    checks.covariance("prior.cov", cov, n)
     heading = np.asarray(cov)[2, 2] if checks.is_concrete(cov) else 0
     if mean.dtype != np.float64 and heading > _UNKNOWN_HEADING:
         raise ValueError(
@@ -73,9 +76,11 @@ def step(
     """One step: predict, correct by every observation slot in turn, update the map at the corrected pose.
 
     Args:
-        params: what is tuned. state: from `init` or the step before. inputs: those of one step, no time axis.
-        landmarks: (L, 2) m, world frame; needed if there are slots.
-        beam_angles: (B,) rad, body frame; needed if there is a grid and a scan.
+        params: what is tuned.
+        state: from `init` or the step before.
+        inputs: those of one step, no time axis.
+        landmarks: (L, 2) m, world frame; needed if there are slots of a sensor that observes landmarks.
+        beam_angles: (B,) rad, in the scanner's frame; needed if there is a grid and a scan.
         config: static.
 
     Returns:
@@ -90,52 +95,8 @@ def step(
             landmark, when it can be looked at, so far out that the state's dtype cannot hold it to a millimetre.
         TypeError: landmark ids that are not integers, a `valid` that is not boolean.
     """
-    state, info = advance(params, state, inputs, landmarks=landmarks, beam_angles=beam_angles, config=config)
-    return settle(state, config=config), info
-
-
-def advance(
-    params: Params,
-    state: State,
-    inputs: Inputs,
-    *,
-    landmarks: jax.Array | None = None,
-    beam_angles: jax.Array | None = None,
-    config: Config,
-) -> tuple[State, Info]:
-    """`step` inside a loop: the same, but cells of the map may stay below l_min until `settle`, which any number of
-    steps can share (`grid.add_scan` says why that changes nothing).
-    """
-    _check_step(params, state, inputs, landmarks, beam_angles, config)
-    if config.grid is not None and state.log_odds is None:
-        raise ValueError("state.log_odds: expected a map, as init makes with this config, got None")
-    dtype = state.belief.mean.dtype  # pinned in init: a carry must not change dtype
-    params, inputs, landmarks, beam_angles = jax.tree.map(
-        lambda x: jnp.asarray(x, dtype if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None),
-        (params, inputs, landmarks, beam_angles),
-    )
-    belief, moved = predict(params, state.belief, inputs.control, inputs.dt, config=config)
-    belief, slots, observed = _correct_landmarks(params, belief, inputs, landmarks, config)
-    # A second source of corrections goes here: a scan matched against `settle(state).log_odds`, which the map below
-    # has not yet seen. It takes (params, belief, inputs, log_odds) and returns a belief and what it reports, as above.
-    log_odds = state.log_odds
-    if log_odds is not None and inputs.ranges is not None and beam_angles is not None:
-        log_odds = map_scan(params, log_odds, belief.mean, inputs.ranges, beam_angles, config=config)
-
-    log_likelihood = state.log_likelihood + jnp.sum(slots.log_likelihood)
-    info = Info(
-        belief=belief,
-        **slots._asdict(),
-        ok=moved & observed & sound(belief),
-    )
-    return State(belief, log_odds, log_likelihood), info
-
-
-def settle(state: State, *, config: Config) -> State:
-    """The state after `advance` as `step` leaves it: the map within its bounds."""
-    if state.log_odds is None or config.grid is None:
-        return state
-    return state._replace(log_odds=grid.clamp(state.log_odds, config.grid))
+    state, info = _recorded_turn(params, state, inputs, landmarks, beam_angles, config)
+    return clamp_map(state, config=config), info
 
 
 def collect_info(state: State, info: Info, aside: Any) -> Info:
@@ -174,15 +135,12 @@ def run(
     """
     _check_run(params, inputs)
 
-    zero = zero_like_any(params, state, inputs, landmarks, beam_angles)
-    state = jax.tree.map(lambda x: x + zero.astype(x.dtype), state)
-
     def body(state: State, now: tuple[Inputs, Any]) -> tuple[State, Any]:
-        state, info = advance(params, state, now[0], landmarks=landmarks, beam_angles=beam_angles, config=config)
-        return state, collect(settle(state, config=config), info, now[1])
+        state, info = _recorded_turn(params, state, now[0], landmarks, beam_angles, config)
+        return state, collect(clamp_map(state, config=config), info, now[1])
 
     state, collected = scan(body, state, (inputs, aside))
-    return settle(state, config=config), collected
+    return clamp_map(state, config=config), collected
 
 
 def map_scans(
@@ -197,8 +155,11 @@ def map_scans(
     """Mapping alone, at given poses.
 
     Args:
-        params: `l_occ` and `l_free` matter. log_odds: (rows, columns) nats, zeros for a new map.
-        poses: (T, 3) m, m, rad. ranges: (T, B) m. beam_angles: (B,) rad, body frame.
+        params: `l_occ` and `l_free` matter.
+        log_odds: (rows, columns) nats, zeros for a new map.
+        poses: (T, 3) m, m, rad, of the robot.
+        ranges: (T, B) m.
+        beam_angles: (B,) rad, in the scanner's frame.
         config: with a grid.
 
     Returns:
@@ -209,14 +170,12 @@ def map_scans(
             when it can be looked at, a pose so far out that the poses' dtype cannot hold it to a millimetre.
     """
     params.check()
-    checks.shape("poses", poses, (None, 3))
+    checks.shape("poses", poses, (None, POSE))
     checks.resolved("poses", poses[:, :2], jnp.result_type(poses))
     checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
 
-    zero = zero_like_any(params, log_odds, poses, ranges, beam_angles)
     log_odds = jnp.asarray(log_odds)
-    log_odds = log_odds + zero.astype(log_odds.dtype)
-    params = Params(*(jnp.asarray(x, log_odds.dtype) for x in params))
+    params = jax.tree.map(lambda x: jnp.asarray(x, log_odds.dtype), params)
 
     def body(log_odds: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
         return map_scan(params, log_odds, now[0], now[1], beam_angles, config=config), None
@@ -225,46 +184,80 @@ def map_scans(
     return grid.clamp(log_odds, map_spec(config))
 
 
-def _correct_landmarks(
-    params: Params, belief: Gaussian, inputs: Inputs, landmarks: jax.Array | None, config: Config
-) -> tuple[Gaussian, Sighting, jax.Array]:
-    """The belief after every slot in turn, what each slot reports, and whether every observation could be used."""
-    slots = inputs.valid.shape[0]
-    zero = zero_like_any(params, belief, inputs, landmarks)
-    real = zero.astype(belief.mean.dtype)
-    empty = Sighting(
-        innovation=jnp.full((slots, 2), real),
-        S=jnp.full((slots, 2, 2), real),
-        nis=jnp.full(slots, real),
-        accepted=jnp.full(slots, zero != 0),
-        log_likelihood=jnp.full(slots, real),
-        row=jnp.full(slots, zero - 1),
+def _recorded_turn(
+    params: Params,
+    state: State,
+    inputs: Inputs,
+    landmarks: jax.Array | None,
+    beam_angles: jax.Array | None,
+    config: Config,
+) -> tuple[State, Info]:
+    """`step.turn` over what was recorded in a step."""
+    _check_step(params, state, inputs, landmarks, beam_angles, config)
+    dtype = state.belief.mean.dtype  # pinned in init: a carry must not change dtype
+    params, inputs, landmarks, beam_angles = jax.tree.map(
+        lambda x: jnp.asarray(x, dtype if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None),
+        (params, inputs, landmarks, beam_angles),
     )
-    if landmarks is None or slots == 0:
-        return belief, empty, jnp.array(True)
-    usable = inputs.valid & is_measurement(inputs.z[:, 0], inputs.z[:, 1]) & (inputs.landmark < len(landmarks))
+    state, slots, ok = turn(
+        params,
+        state,
+        inputs.control,
+        inputs.dt,
+        observe=lambda belief: _observe_slots(params, belief, inputs, landmarks, config),
+        ranges=inputs.ranges,
+        beam_angles=beam_angles,
+        config=config,
+    )
+    return state, Info(belief=state.belief, **slots._asdict(), ok=ok)
 
-    def associate(belief: Gaussian, z: jax.Array, landmark: jax.Array) -> jax.Array:
-        best = sensor.associate(*belief, z, landmarks, params.R, config.sensor_offset)
-        return jnp.where(landmark < 0, best, landmark)
 
-    def slot(belief: Gaussian, now: tuple[Any, ...]) -> tuple[Gaussian, tuple[Sighting, jax.Array]]:
-        z_range, z_bearing, landmark, usable = now
-        z, unknown = jnp.stack([z_range, z_bearing]), any_in_batch(usable & (landmark < 0))
-        row = cond(unknown, associate, lambda belief, z, landmark: landmark, belief, z, landmark)
-        position = landmarks[jnp.maximum(row, 0)]
-        belief, report, used = correct(params, belief, z, position, row, usable, config=config)
+def _observe_slots(
+    params: Params, belief: Gaussian, inputs: Inputs, landmarks: jax.Array | None, config: Config
+) -> Observed:
+    """The belief corrected by every slot in turn."""
+    sensor, dtype = sensors.resolve(config.sensor), belief.mean.dtype
+    slots, m = inputs.valid.shape[0], sensor.dim
+    empty = Observation(
+        innovation=jnp.zeros((slots, m), dtype),
+        S=jnp.zeros((slots, m, m), dtype),
+        nis=jnp.zeros(slots, dtype),
+        accepted=jnp.zeros(slots, bool),
+        log_likelihood=jnp.zeros(slots, dtype),
+        row=jnp.full(slots, -1, jnp.int32),
+    )
+    if slots == 0:
+        return Observed(belief, empty, jnp.zeros((), dtype), jnp.array(True))
+    possible = inputs.valid & jax.vmap(sensor.is_measurement)(inputs.z)
+    rows = inputs.landmark.astype(jnp.int32)
+    if landmarks is None or not sensor.landmarks:
+        rows, landmarks = jnp.zeros_like(rows), jnp.zeros((1, 2), dtype)
+    possible = possible & (rows < len(landmarks))
+
+    def associate(belief: Gaussian, z: jax.Array, row: jax.Array) -> jax.Array:
+        R = params.block(sensor.noise)
+        best = sensors.associate(*belief, z, landmarks, R, sensor=sensor, offset=config.sensor_offset)
+        return jnp.where(row < 0, best, row)
+
+    def slot(belief: Gaussian, now: tuple[Any, ...]) -> tuple[Gaussian, tuple[Observation, jax.Array]]:
+        *z, row, usable = now
+        z = jnp.stack(z)
+        if sensor.landmarks:
+            unknown = any_in_batch(usable & (row < 0))
+            row = cond(unknown, associate, lambda belief, z, row: row, belief, z, row)
+        landmark = landmarks[jnp.maximum(row, 0)]
+        belief, report, used = correct(params, belief, z, landmark, row, usable, config=config)
         return belief, (report, used)
 
-    def somebody(belief: Gaussian, z: jax.Array) -> tuple[Gaussian, tuple[Sighting, jax.Array]]:
-        z = jnp.where(usable[:, None], z, 0)
-        return scan(slot, belief, (z[:, 0], z[:, 1], inputs.landmark.astype(jnp.int32), usable))
+    def somebody(belief: Gaussian, z: jax.Array) -> tuple[Gaussian, tuple[Observation, jax.Array]]:
+        z = jnp.where(possible[:, None], z, 0)
+        return scan(slot, belief, (*(z[:, i] for i in range(m)), rows, possible))
 
-    def nobody(belief: Gaussian, _: jax.Array) -> tuple[Gaussian, tuple[Sighting, jax.Array]]:
-        return belief, (empty, usable)
+    def nobody(belief: Gaussian, _: jax.Array) -> tuple[Gaussian, tuple[Observation, jax.Array]]:
+        return belief, (empty, possible)
 
-    belief, (report, used) = cond(any_in_batch(usable), somebody, nobody, belief, inputs.z)
-    return belief, report, jnp.all(used == inputs.valid)
+    belief, (report, used) = cond(any_in_batch(possible), somebody, nobody, belief, inputs.z)
+    return Observed(belief, report, jnp.sum(report.log_likelihood), jnp.all(used == inputs.valid))
 
 
 def _check_step(
@@ -275,25 +268,27 @@ def _check_step(
     beam_angles: jax.Array | None,
     config: Config,
 ) -> None:
-    for name, value, shape in (
-        ("params.Q", params.Q, (2, 2)),
-        ("params.R", params.R, (2, 2)),
-        ("state.belief.mean", state.belief.mean, (3,)),
-        ("state.belief.cov", state.belief.cov, (3, 3)),
-        ("state.log_likelihood", state.log_likelihood, ()),
-    ):
-        checks.shape(name, value, shape)
+    model, sensor = motion.resolve(config.motion), sensors.resolve(config.sensor)
+    for block in model.noise:
+        params.block(block)
+    checks.shape("state.belief.mean", state.belief.mean, (model.dim,))
+    checks.shape("state.belief.cov", state.belief.cov, (model.dim, model.dim))
+    checks.shape("state.log_likelihood", state.log_likelihood, ())
+    if config.grid is not None and state.log_odds is None:
+        raise ValueError("state.log_odds: expected a map, as init makes with this config, got None")
     checks.shape("inputs.dt", inputs.dt, ())
-    checks.shape("inputs.control", inputs.control, (2,))
+    model.full_input(inputs.control)
     checks.shape("inputs.valid", inputs.valid, (None,))
     slots = np.shape(inputs.valid)[0]
     checks.shape("inputs.landmark", inputs.landmark, (slots,))
-    checks.shape("inputs.z", inputs.z, (slots, 2))
+    checks.shape("inputs.z", inputs.z, (slots, sensor.dim))
     for name, value in (("dt", inputs.dt), ("control", inputs.control), ("z", inputs.z)):
         checks.dtype(f"inputs.{name}", value, np.floating)
     checks.dtype("inputs.landmark", inputs.landmark, np.integer)
     checks.dtype("inputs.valid", inputs.valid, np.bool_)
     if slots:
+        params.block(sensor.noise)
+    if slots and sensor.landmarks:
         if landmarks is None:
             raise ValueError(f"landmarks: expected (L, 2) for the {slots} observation slots, got None")
         checks.shape("landmarks", landmarks, (None, 2))

@@ -1,98 +1,166 @@
-"""Range-bearing sensor: what a pose should see of a landmark, how that changes with the pose, and which landmark
-an anonymous observation belongs to.
-
-The sensor sits at `sensor_offset = (dx, dy, dtheta)` in the body frame.
+"""Sensors: what one expects to measure of a state, how that changes with the state, and which landmark an anonymous
+observation belongs to. Landmarks by range and bearing are here.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import Matrix, mahalanobis, sandwich
-from jaxlocmap._internal.trig import arctan2, sin_cos
-from jaxlocmap.motion import wrap
+from jaxlocmap._internal.linalg import Matrix, mahalanobis, quadratic_form
+from jaxlocmap._internal.trig import arctan2
+from jaxlocmap.parameters import Block, R
+from jaxlocmap.se2 import POSE, Offset, compose, wrap
 
-Offset = tuple[float, float, float]
+CENTRE: Offset = (0.0, 0.0, 0.0)
 
 _TOUCHING = 1e-9  # m^2: closer than this, a landmark has no bearing
 
 
-def sensor_pose(pose: jax.Array, offset: Offset) -> tuple[jax.Array, jax.Array, jax.Array, Matrix]:
-    """Where a sensor stands that is mounted at an offset from the robot's centre.
+class Sensor(NamedTuple):
+    """What a sensor measures. Functions and names, so a sensor is hashable and static under jit.
 
-        s = (x + dx cos(theta) - dy sin(theta), y + dx sin(theta) + dy cos(theta), theta + dtheta)
+    The functions take the state with the pose of the sensor itself in the place of the robot's (`Config.sensor_offset`)
+    and the position of a landmark, None where `landmarks` is False.
+    """
 
-    Args:
-        pose: (3,) m, m, rad. offset: (dx, dy, dtheta) m, m, rad in the body frame.
+    noise: Block  # the covariance of an observation: its components are those of z, m of them
+    expected: Callable[..., Any]  # (state (n,), landmark (2,) m) -> z (m,); angles need not be wrapped
+    jacobian: Callable[..., Any] | None = None  # same arguments -> (m, 3) by the pose or (m, n); None: by autodiff
+    defined: Callable[..., Any] | None = None  # same arguments -> () bool: there is such an observation; None: always
+    angles: tuple[int, ...] = ()  # entries of z that are angles
+    positive: tuple[int, ...] = ()  # entries of z that are above zero, such as a range
+    landmarks: bool = True  # it observes landmarks; False: the state alone, as GPS and compass do
 
-    Returns:
-        x, y (), m; heading (), rad, not wrapped; 3x3 `Matrix`, ds / dpose.
+    @property
+    def dim(self) -> int:
+        """The length m of an observation."""
+        return len(self.noise.components)
+
+    def residual(self, z: jax.Array, expected: jax.Array) -> jax.Array:
+        """Z minus what is expected, (m,), angles wrapped."""
+        return jnp.stack(
+            [wrap(z[i] - expected[i]) if i in self.angles else z[i] - expected[i] for i in range(self.dim)]
+        )
+
+    def is_measurement(self, z: jax.Array) -> jax.Array:
+        """Whether z (m,) can have been measured: () bool, finite, and above zero where it must be."""
+        possible = jnp.isfinite(sum(z[i] for i in range(self.dim)))
+        for i in self.positive:
+            possible = possible & (z[i] > 0)
+        return possible
+
+
+def _to_landmark(state: jax.Array, landmark: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """dx, dy, dx² + dy² to the landmark and whether it has a bearing; if not, those of one a metre ahead along x: sqrt
+    and atan2 at 0 have NaN gradients even where they are not chosen.
+    """
+    dx, dy = landmark[0] - state[0], landmark[1] - state[1]
+    q = dx * dx + dy * dy
+    defined = q > _TOUCHING
+    return jnp.where(defined, dx, 1.0), jnp.where(defined, dy, 0.0), jnp.where(defined, q, 1.0), defined
+
+
+def _expected_range_bearing(state: jax.Array, landmark: jax.Array) -> jax.Array:
+    dx, dy, q, _ = _to_landmark(state, landmark)
+    return jnp.stack([jnp.sqrt(q), arctan2(dy, dx) - state[2]])
+
+
+def _range_bearing_jacobian(state: jax.Array, landmark: jax.Array) -> Matrix:
+    dx, dy, q, _ = _to_landmark(state, landmark)
+    r = jnp.sqrt(q)
+    return Matrix([[-dx / r, -dy / r, 0], [dy / q, -dx / q, -1]])
+
+
+RANGE_BEARING = Sensor(
+    noise=R,
+    expected=_expected_range_bearing,
+    jacobian=_range_bearing_jacobian,
+    defined=lambda state, landmark: _to_landmark(state, landmark)[3],
+    angles=(1,),
+    positive=(0,),
+)
+"""Range and bearing of landmarks, not defined where a landmark lies on the sensor (Thrun, Burgard & Fox 2005,
+section 6.6)."""
+
+SENSORS = {"range_bearing": RANGE_BEARING}
+
+
+def resolve(sensor: str | Sensor) -> Sensor:
+    """The sensor of that name; a sensor passes through.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: an unknown name.
     """
-    checks.shape("pose", pose, (3,))
-    dx, dy, dtheta = offset
-    heading = pose[2] + dtheta if dtheta else pose[2]
-    if dx == 0 and dy == 0:
-        return pose[0], pose[1], heading, Matrix.identity(3)
-    s, c = sin_cos(pose[2])
-    right, up = dx * c - dy * s, dx * s + dy * c
-    return pose[0] + right, pose[1] + up, heading, Matrix([[1, 0, -up], [0, 1, right], [0, 0, 1]])
+    if isinstance(sensor, Sensor):
+        return sensor
+    if sensor not in SENSORS:
+        raise ValueError(f"sensor: expected one of {sorted(SENSORS)} or a Sensor, got {sensor!r}")
+    return SENSORS[sensor]
 
 
-def observe(pose: jax.Array, landmark: jax.Array, sensor_offset: Offset = (0.0, 0.0, 0.0)) -> jax.Array:
-    """Expected observation: range and bearing from the sensor to a landmark.
+def observe(
+    state: jax.Array, landmark: jax.Array | None, *, sensor: Sensor = RANGE_BEARING, offset: Offset = CENTRE
+) -> jax.Array:
+    """What a sensor expects to measure.
 
+        z = h(state with the pose of the sensor, landmark),  of `RANGE_BEARING`
         [ |l - s|,  atan2(l_y - s_y, l_x - s_x) - theta - dtheta ],  s the sensor's position
 
     Args:
-        pose: (3,) m, m, rad. landmark: (2,) m, world frame.
-        sensor_offset: (dx, dy, dtheta) m, m, rad in the body frame.
+        state: (n,), beginning with the pose in m, m, rad.
+        landmark: (2,) m, world frame; None if the sensor observes none.
+        sensor: static.
+        offset: (dx, dy, dtheta) m, m, rad of the sensor in the body frame; static.
 
     Returns:
-        (2,) range m, bearing rad wrapped; no gradient where the landmark lies on the sensor.
-        Source: Thrun, Burgard & Fox 2005, section 6.6.
+        (m,) in the units of the sensor's noise, angles wrapped.
 
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shape("landmark", landmark, (2,))
-    x, y, heading, _ = sensor_pose(pose, sensor_offset)
-    dx, dy = landmark[0] - x, landmark[1] - y
-    return jnp.stack([jnp.hypot(dx, dy), wrap(arctan2(dy, dx) - heading)])
+    state, _ = _mounted(state, landmark, sensor, offset)
+    z = sensor.expected(state, landmark)
+    return jnp.stack([wrap(z[i]) if i in sensor.angles else z[i] for i in range(sensor.dim)])
 
 
 def linearise(
-    pose: jax.Array, landmark: jax.Array, z: jax.Array, sensor_offset: Offset = (0.0, 0.0, 0.0)
+    state: jax.Array,
+    landmark: jax.Array | None,
+    z: jax.Array,
+    *,
+    sensor: Sensor = RANGE_BEARING,
+    offset: Offset = CENTRE,
 ) -> tuple[jax.Array, Matrix, jax.Array]:
     """Residual of an observation and the Jacobian of its expectation.
 
     Args:
-        pose: (3,) m, m, rad. landmark: (2,) m. z: (2,) range m, bearing rad.
-        sensor_offset: (dx, dy, dtheta) m, m, rad in the body frame.
+        state, landmark, sensor, offset: as in `observe`.
+        z: (m,) the observation.
 
     Returns:
-        residual: (2,) z minus `observe`, bearing wrapped. H: 2x3 `Matrix`, d observe / d pose.
-        defined: () bool, False where the landmark lies on the sensor and has no bearing (H is then that of a
-        landmark one metre away, so that gradients stay finite).
+        residual: (m,) z minus `observe`, angles wrapped.
+        H: m x 3 or m x n `Matrix`, d observe / d state; zero beyond its columns.
+        defined: () bool, False where there is no such observation, as of the bearing of a landmark on the sensor.
 
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(landmark=(landmark, (2,)), z=(z, (2,)))
-    x, y, heading, J = sensor_pose(pose, sensor_offset)
-    dx, dy = landmark[0] - x, landmark[1] - y
-    q = dx * dx + dy * dy
-    defined = q > _TOUCHING
-    # Safe on both sides of the select: sqrt and atan2 at 0 have NaN gradients even where they are not chosen.
-    dx, dy, q = jnp.where(defined, dx, 1.0), jnp.where(defined, dy, 0.0), jnp.where(defined, q, 1.0)
-    r = jnp.sqrt(q)
-    residual = jnp.stack([z[0] - r, wrap(z[1] - arctan2(dy, dx) + heading)])
-    H = Matrix([[-dx / r, -dy / r, 0], [dy / q, -dx / q, -1]]) @ J
-    return residual, H, defined
+    mounted, J = _mounted(state, landmark, sensor, offset)
+    checks.shape("z", z, (sensor.dim,))
+    expected = sensor.expected(mounted, landmark)
+    checks.shape(f"expected {sensor.noise.name}", expected, (sensor.dim,))
+    H = Matrix.of((sensor.jacobian or jax.jacfwd(sensor.expected))(mounted, landmark))
+    if H.shape not in ((sensor.dim, POSE), (sensor.dim, len(state))):
+        raise ValueError(f"jacobian of {sensor.noise.name}: expected {sensor.dim} x 3 or x {len(state)}, got {H.shape}")
+    by_pose = Matrix(row[:POSE] for row in H.rows) @ J
+    H = Matrix(front + back[POSE:] for front, back in zip(by_pose.rows, H.rows, strict=True))
+    defined = jnp.array(True) if sensor.defined is None else sensor.defined(mounted, landmark)
+    return sensor.residual(z, expected), H, defined
 
 
 def associate(
@@ -101,16 +169,21 @@ def associate(
     z: jax.Array,
     landmarks: jax.Array,
     R: jax.Array,
-    sensor_offset: Offset = (0.0, 0.0, 0.0),
+    *,
+    sensor: Sensor = RANGE_BEARING,
+    offset: Offset = CENTRE,
 ) -> jax.Array:
     """The landmark an anonymous observation most likely came from: the smallest Mahalanobis distance.
 
         argmin_j  r_jᵀ (H_j P H_jᵀ + R)⁻¹ r_j
 
     Args:
-        mean: (3,) m, m, rad. cov: (3, 3). z: (2,) range m, bearing rad.
-        landmarks: (L, 2) m. R: (2, 2) m², rad².
-        sensor_offset: (dx, dy, dtheta) m, m, rad in the body frame.
+        mean: (n,) state.
+        cov: (n, n).
+        z: (m,) the observation.
+        landmarks: (L, 2) m.
+        R: (m, m) its covariance.
+        sensor, offset: as in `observe`.
 
     Returns:
         () int32 row of `landmarks`. Source: Thrun, Burgard & Fox 2005, section 7.5 (there with the maximum
@@ -119,14 +192,30 @@ def associate(
     Raises:
         ValueError: a wrong shape, or no landmark.
     """
-    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)), z=(z, (2,)), landmarks=(landmarks, (None, 2)), R=(R, (2, 2)))
+    n, m = len(mean), sensor.dim
+    checks.shapes(mean=(mean, (None,)), cov=(cov, (n, n)), z=(z, (m,)), landmarks=(landmarks, (None, 2)), R=(R, (m, m)))
     if not len(landmarks):
         raise ValueError("landmarks: expected at least one to choose from, got (0, 2)")
-    P, noise = Matrix.symmetric(cov), Matrix.symmetric(R)
+    noise = Matrix.symmetric(R)
 
     def distance(landmark: jax.Array) -> jax.Array:
-        residual, H, defined = linearise(mean, landmark, z, sensor_offset)
-        d2 = mahalanobis(sandwich(H, P) + noise, (residual[0], residual[1]))
+        residual, H, defined = linearise(mean, landmark, z, sensor=sensor, offset=offset)
+        d2 = mahalanobis(innovation_covariance(cov, H) + noise, tuple(residual[i] for i in range(m)))
         return jnp.where(defined, d2, jnp.inf)
 
     return jnp.argmin(jax.vmap(distance)(landmarks)).astype(jnp.int32)
+
+
+def innovation_covariance(cov: jax.Array, H: Matrix) -> Matrix:
+    """H P Hᵀ, of the columns of H alone: it is zero beyond."""
+    k = H.shape[1]
+    return quadratic_form(H, Matrix.symmetric(cov[:k, :k]))
+
+
+def _mounted(state: jax.Array, landmark: Any, sensor: Sensor, offset: Offset) -> tuple[jax.Array, Matrix]:
+    """The state with the sensor's pose in the place of the robot's, and the Jacobian of the one by the other."""
+    checks.shape("state", state, (None,))
+    if sensor.landmarks:
+        checks.shape("landmark", landmark, (2,))
+    pose, J = compose(state[:POSE], offset)
+    return (pose if len(state) == POSE else jnp.concatenate([pose, state[POSE:]])), J

@@ -1,46 +1,33 @@
-"""What a step is made of: predict, correct by one observation, add a scan to the map. No loop."""
+"""One step: predict, observe, map. The order of a step stands in `turn` and nowhere else; there is no loop here."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap import checks
-from jaxlocmap import sensors as sensor
-from jaxlocmap._internal.linalg import Matrix, is_psd, stack
+from jaxlocmap import checks, motion, sensors
+from jaxlocmap._internal.linalg import is_psd, stack_scalars
 from jaxlocmap.filters import ekf
 from jaxlocmap.mapping import grid
-from jaxlocmap.motion import resolve
-from jaxlocmap.types import Config, Gaussian, GridSpec, Params
+from jaxlocmap.se2 import POSE
+from jaxlocmap.types import Config, Gaussian, GridSpec, Params, State
 
 
-def predict(
-    params: Params, belief: Gaussian, control: jax.Array, dt: jax.Array, *, config: Config
-) -> tuple[Gaussian, jax.Array]:
-    """The moved belief, and whether control and step length were usable. Without a control the robot is taken to
-    stand still, with a belief that grows by Q all the same; without a step length, for a nominal step.
+class Observed(NamedTuple):
+    """What the observations of a step make of the belief."""
 
-    Raises:
-        ValueError: a wrong shape.
-    """
-    checks.shapes(control=(control, (2,)), dt=(dt, ()))
-    timed = jnp.isfinite(dt) & (dt >= 0)
-    usable = jnp.isfinite(control[0]) & jnp.isfinite(control[1]) & timed
-    mean, cov = ekf.predict(
-        *belief,
-        jnp.stack([jnp.where(usable, control[0], 0), jnp.where(usable, control[1], 0)]),
-        jnp.where(timed, dt, config.dt),
-        params.Q,
-        motion=resolve(config.motion),
-        nominal_dt=config.dt,
-    )
-    return Gaussian(mean, cov), usable
+    belief: Gaussian
+    report: Any  # what the loop wants to keep of them
+    log_likelihood: jax.Array  # () nats, summed over them
+    ok: jax.Array  # () bool: every one could be used
 
 
-class Sighting(NamedTuple):
-    """What the filter reports of an observation: the middle of `Info`."""
+class Observation(NamedTuple):
+    """What the filter reports of one observation: the middle of `Info`."""
 
     innovation: jax.Array
     S: jax.Array
@@ -50,40 +37,141 @@ class Sighting(NamedTuple):
     row: jax.Array
 
 
+def turn(
+    params: Params,
+    state: State,
+    control: jax.Array,
+    dt: jax.Array,
+    *,
+    observe: Callable[[Gaussian], Observed],
+    ranges: jax.Array | None,
+    beam_angles: jax.Array | None,
+    config: Config,
+) -> tuple[State, Any, jax.Array]:
+    """Predict the belief, correct it by what is observed, add the scan to the map at the corrected pose.
+
+    A second source of corrections, such as a scan matched against the map, goes where `observe` is: it takes the
+    belief, and the map before this scan as `clamp_map` reads it, and returns an `Observed` too.
+
+    Args:
+        params: what is tuned.
+        state: of the step before. Cells of its map may lie below `l_min` until they are read through `clamp_map`,
+            which any number of steps can share (`grid.add_scan` says why that changes nothing).
+        control: (c,), moves the pose over this step.
+        dt: () s.
+        observe: corrects the belief by one observation after the other (`correct`): recorded or simulated ones.
+        ranges: (B,) m; None without a scanner.
+        beam_angles: (B,) rad; None without a scanner.
+        config: static.
+
+    Returns:
+        The state after this step, what `observe` reports, and () bool whether control, step length and observations
+        could be used and the belief is valid.
+
+    Raises:
+        ValueError: a wrong shape, or a block that `params` lacks.
+    """
+    belief, moved = predict(params, state.belief, control, dt, config=config)
+    observed = observe(belief)
+    belief, log_odds = observed.belief, state.log_odds
+    if log_odds is not None and ranges is not None and beam_angles is not None:
+        log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
+    ok = moved & observed.ok & is_valid(belief)
+    return State(belief, log_odds, state.log_likelihood + observed.log_likelihood), observed.report, ok
+
+
+def clamp_map(state: State, *, config: Config) -> State:
+    """The state as it is read, its map within its bounds."""
+    if state.log_odds is None or config.grid is None:
+        return state
+    return state._replace(log_odds=grid.clamp(state.log_odds, config.grid))
+
+
+def predict(
+    params: Params, belief: Gaussian, control: jax.Array, dt: jax.Array, *, config: Config
+) -> tuple[Gaussian, jax.Array]:
+    """The moved belief, and whether control and step length were usable. Without a control the robot is taken to
+    stand still, with a belief that grows by its noise all the same; without a step length, for a nominal step.
+
+    Raises:
+        ValueError: a wrong shape, or a block of noise that `params` lacks.
+    """
+    checks.shapes(control=(control, (None,)), dt=(dt, ()))
+    model = motion.resolve(config.motion)
+    timed = jnp.isfinite(dt) & (dt >= 0)
+    usable = timed
+    for i in range(len(control)):
+        usable = usable & jnp.isfinite(control[i])
+    mean, cov = ekf.predict(
+        *belief,
+        jnp.stack([jnp.where(usable, control[i], 0) for i in range(len(control))]),
+        jnp.where(timed, dt, config.dt),
+        params.covariance(model.noise),
+        motion=model,
+        nominal_dt=config.dt,
+    )
+    return Gaussian(mean, cov), usable
+
+
 def correct(
     params: Params,
     belief: Gaussian,
     z: jax.Array,
-    landmark: jax.Array,
+    landmark: jax.Array | None,
     row: jax.Array,
     usable: jax.Array,
     *,
     config: Config,
-) -> tuple[Gaussian, Sighting, jax.Array]:
-    """The belief after one observation z (2,) of the landmark (2,) in a row of the list, what is reported of it (all
-    zero, row -1, if it was not used), and whether it was used. A range that is not above zero is no measurement, and a
-    landmark so far out that its dtype cannot hold it to a millimetre is no place to measure from.
+) -> tuple[Gaussian, Observation, jax.Array]:
+    """Correct the belief by one observation.
+
+    Args:
+        params: with the noise of the sensor.
+        belief: before.
+        z: (m,). What the sensor cannot have measured, such as a range that is not above zero, is left out.
+        landmark: (2,) m. One so far out that its dtype cannot hold it to a millimetre is no place to measure from. A
+            sensor that observes none takes no notice.
+        row: () int32 of the landmark in its list, to be reported.
+        usable: () bool; False leaves the belief as it is.
+        config: static.
+
+    Returns:
+        The belief after, what is reported of the observation (all zero, row -1, if it was not used), and () bool
+        whether it was used.
 
     Raises:
-        ValueError: a wrong shape.
+        ValueError: a wrong shape, or a block of noise that `params` lacks.
     """
-    checks.shapes(mean=(belief.mean, (3,)), cov=(belief.cov, (3, 3)))
-    checks.shapes(z=(z, (2,)), landmark=(landmark, (2,)), row=(row, ()), usable=(usable, ()))
-    usable = usable & is_measurement(z[0], z[1])
-    z = jnp.stack([jnp.where(usable, z[i], 0) for i in range(2)])  # what is no number would spoil derivatives
-    residual, H, defined = sensor.linearise(belief.mean, landmark, z, config.sensor_offset)
-    used = usable & defined & is_held(landmark[0], landmark[1])
-    threshold = ekf.gate_threshold(config.gate_probability, 2)
-    softness = config.gate_softness
-    update = ekf.update(*belief, residual, H, params.R, threshold=threshold, softness=softness, valid=used)
+    sensor, model = sensors.resolve(config.sensor), motion.resolve(config.motion)
+    m, n = sensor.dim, model.dim
+    checks.shapes(mean=(belief.mean, (n,)), cov=(belief.cov, (n, n)))
+    checks.shapes(z=(z, (m,)), row=(row, ()), usable=(usable, ()))
+    landmark = landmark if sensor.landmarks else None
+    usable = usable & sensor.is_measurement(z)
+    z = jnp.stack([jnp.where(usable, z[i], 0) for i in range(m)])  # what is no number would spoil derivatives
+    offset = config.sensor_offset
+    residual, H, defined = sensors.linearise(belief.mean, landmark, z, sensor=sensor, offset=offset)
+    used = usable & defined
+    if landmark is not None:
+        used = used & is_held(landmark[0], landmark[1])
+    update = ekf.update(
+        *belief,
+        residual,
+        H,
+        params.covariance((sensor.noise,)),
+        threshold=_gate_threshold(params, config, m, z.dtype),
+        temperature=config.gate_temperature,
+        valid=used,
+        angles=model.angles,
+    )
 
     def known(x: jax.Array) -> jax.Array:
         return jnp.where(used, x, jnp.zeros_like(x))
 
     S = update.S
-    report = Sighting(
-        innovation=jnp.stack([known(update.innovation[i]) for i in range(2)]),
-        S=stack([[known(S[i, j]) for j in range(2)] for i in range(2)]),
+    report = Observation(
+        innovation=jnp.stack([known(update.innovation[i]) for i in range(m)]),
+        S=stack_scalars([[known(S[i, j]) for j in range(m)] for i in range(m)]),
         nis=known(update.nis),
         accepted=update.accepted,
         log_likelihood=known(update.log_likelihood),
@@ -92,29 +180,22 @@ def correct(
     return Gaussian(update.mean, update.cov), report, used & jnp.isfinite(update.nis)
 
 
-def is_measurement(reach: jax.Array, bearing: jax.Array) -> jax.Array:
-    """Whether a range, m, and a bearing, rad, can have been measured: finite, and the range above zero. Any shape."""
-    return (reach > 0) & jnp.isfinite(reach + bearing)
+def _gate_threshold(params: Params, config: Config, dimension: int, dtype: Any) -> Any:
+    if params.gate_probability is None:
+        return ekf.gate_threshold(config.gate_probability, dimension)
+    return ekf.gate_threshold(jnp.asarray(params.gate_probability, dtype), dimension)
 
 
 def map_scan(
-    params: Params, log_odds: jax.Array, pose: jax.Array, ranges: jax.Array, beam_angles: jax.Array, *, config: Config
+    params: Params, log_odds: jax.Array, mean: jax.Array, ranges: jax.Array, beam_angles: jax.Array, *, config: Config
 ) -> jax.Array:
-    """The map after one more scan; bounded below only after `settle`."""
-    return grid.add_scan(
-        log_odds,
-        pose,
-        ranges,
-        beam_angles,
-        params.l_occ,
-        params.l_free,
-        spec=map_spec(config),
-        min_range=config.min_range,
-        max_range=config.max_range,
-    )
+    """The map after one more scan, taken at the pose that a state's mean (n,) begins with; to be read clamped."""
+    amounts = params.l_occ, params.l_free
+    scanner, spec = config.scanner(beam_angles), map_spec(config)
+    return grid.add_scan(log_odds, mean[:POSE], ranges, *amounts, scanner=scanner, spec=spec)
 
 
-def sound(belief: Gaussian) -> jax.Array:
+def is_valid(belief: Gaussian) -> jax.Array:
     """Whether a belief is finite, its covariance positive semi-definite, and its place one that its dtype can hold to a
     millimetre.
 
@@ -122,8 +203,10 @@ def sound(belief: Gaussian) -> jax.Array:
         ValueError: a wrong shape.
     """
     mean, cov = belief
-    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)))
-    return is_psd(Matrix.of(cov)) & is_held(mean[0], mean[1]) & jnp.isfinite(mean[2])
+    checks.shape("mean", mean, (None,))
+    checks.shape("cov", cov, (len(mean), len(mean)))
+    rest = functools.reduce(jnp.add, [mean[i] for i in range(2, len(mean))])
+    return is_psd(cov) & is_held(mean[0], mean[1]) & jnp.isfinite(rest)
 
 
 def is_held(x: jax.Array, y: jax.Array) -> jax.Array:

@@ -17,7 +17,7 @@ SHORT = dataclasses.replace(
     sight_period=2,
     grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20)),
 )
-OWN = simulation.own_params(simulation.Noise(), SHORT.dt)
+OWN = simulation.own_params(simulation.Noise(), SHORT)
 CONFIG = SHORT.config(motion="euler", gate_probability=0.9999)
 ONLY_POSES = SHORT.config(motion="euler", gate_probability=0.9999, grid=False)
 

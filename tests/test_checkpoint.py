@@ -270,9 +270,9 @@ def test_the_lock_of_a_killed_process_holds_nobody_up(folder):
     code = f"""if 1:
         import os, signal, sys
         sys.path.insert(0, {str(Path(__file__).parent)!r})
-        import test_parts, pathlib
-        parts = test_parts.at(pathlib.Path({str(folder)!r}))
-        parts.open(test_parts.STUDY, range(8))
+        import test_checkpoint, pathlib
+        parts = test_checkpoint.at(pathlib.Path({str(folder)!r}))
+        parts.open(test_checkpoint.STUDY, range(8))
         os.kill(os.getpid(), signal.SIGKILL)
     """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
@@ -392,8 +392,8 @@ def test_the_manifest_is_the_same_in_another_process():
         jax.config.update("jax_num_cpu_devices", 2)
         jax.jit(lambda x: x * 2)(3.0)  # something else before
         sys.path.insert(0, {str(Path(__file__).parent)!r})
-        import test_parts
-        print(json.dumps(test_parts.made()))
+        import test_checkpoint
+        print(json.dumps(test_checkpoint.made()))
     """
     shared = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false"}  # a GPU, where there is one
     done = subprocess.run([sys.executable, "-c", code], env=shared, capture_output=True, text=True, check=False)

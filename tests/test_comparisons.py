@@ -152,8 +152,8 @@ def test_optimisers_are_compared_by_when_they_reach_the_best(monkeypatch, quick,
     assert rows[0]["gate_accept_rate"] == 0.99
     assert len(rows[0]) == 11
     for objective, start, batch, short in given:
-        assert (objective.weights, short) == ((("innovation", 1.0),), quick)
-        assert (objective.config.gate_probability, objective.config.gate_softness) == (0.9999, 2.0)
+        assert (objective.weights, short) == ((("innovation_nll", 1.0),), quick)
+        assert (objective.config.gate_probability, objective.config.gate_temperature) == (0.9999, 2.0)
         np.testing.assert_array_equal(start.R, simulation.course_params().R)
         assert batch == (simulation.CAPSTONE, 30, 5)
 
@@ -265,7 +265,7 @@ def test_the_memory_of_a_gradient_is_a_run_s_with_everything(monkeypatch):
     ((_, runs, *_), how) = drawn.calls[0]
     assert (runs, how["scenario"].steps, how["scans"]) == (4, 480, True)
     ((settings, weights), _) = objective.calls[0]
-    assert (settings.grid is not None, weights) == (True, (("innovation", 1.0), ("map", 1.0)))
+    assert (settings.grid is not None, weights) == (True, (("innovation_nll", 1.0), ("map", 1.0)))
     assert asked.calls[0][0][2] == ("v", "w", "range", "bearing", "l_occ", "l_free")
     ((at, batch), _) = lowered.calls[0]
     assert (set(at), batch) == ({"v", "w", "range", "bearing", "l_occ", "l_free"}, "batch")
@@ -414,8 +414,8 @@ def jobs(monkeypatch, **options):
 def test_robots_are_tuned_loss_by_loss_and_split_by_split(monkeypatch):
     made = jobs(monkeypatch, splits=2, seed=4)
     assert [(what, loss) for what, loss, _ in made] == [
-        *(("woods", loss) for loss in ("innovation", "state", "nees", "pose")),
-        *((f"mrclam {rest}", loss) for loss in ("innovation", "pose") for rest in ("4, 5", "3, 5")),
+        *(("woods", loss) for loss in ("innovation_nll", "state", "nees", "pose")),
+        *((f"mrclam {rest}", loss) for loss in ("innovation_nll", "pose") for rest in ("4, 5", "3, 5")),
         ("intel", "map"),
     ]
     for _, loss, args in made:
@@ -471,7 +471,7 @@ def test_means_over_robots_and_over_splits():
         }
 
     rows = [row("pose", True, 9.0, 3.0, 0.1), row("pose", True, 7.0, 2.0, 0.2), row("pose", False, 1.0, 1.0, 1.0)]
-    rows += [row("innovation", True, 4.0, 6.0, 0.5)]
+    rows += [row("innovation_nll", True, 4.0, 6.0, 0.5)]
     pose, innovation = tune_robots._summaries(rows)
     assert pose == {
         "log": "mrclam, two robots of five, 2 splits",
@@ -482,7 +482,7 @@ def test_means_over_robots_and_over_splits():
         "after": {"anees": 2.5},
         "anees_of_splits": [2.0, 3.0],
     }
-    assert (innovation["loss"], innovation["after"]) == ("innovation", {"anees": 6.0})
+    assert (innovation["loss"], innovation["after"]) == ("innovation_nll", {"anees": 6.0})
 
 
 def test_the_table_of_robots_has_a_start_for_each_log():

@@ -94,7 +94,7 @@ def test_cells_are_counted_by_probability_as_numpy_does():
     """The clamp of a bin's index: certain cells belong to the last."""
     log_odds = np.random.default_rng(3).normal(0, 3, (64, 64)).astype(np.float32)
     log_odds[0, :2] = -100, 100
-    score = jax.jit(grid.score)(jnp.asarray(log_odds), jnp.zeros((64, 64), bool), jnp.ones((64, 64), bool))
+    score = jax.jit(quality.score)(jnp.asarray(log_odds), jnp.zeros((64, 64), bool), jnp.ones((64, 64), bool))
     probability = 1 / (1 + np.exp(-log_odds.astype(np.float64)))
     assert np.min(abs(probability * 10 - np.round(probability * 10))[1:]) > 1e-6  # none between two bins
     np.testing.assert_array_equal(score.cells, np.histogram(probability, bins=10, range=(0, 1))[0])

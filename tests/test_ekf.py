@@ -307,7 +307,7 @@ def test_a_soft_gate_is_an_update_with_r_over_w(residual, tolerance):
     """w = 1 / (1 + exp((d² - threshold) / softness)), and no smaller than 1e-6; what is reported is of R itself."""
     threshold, softness, H = 9.21, 2.0, np.array([[-0.8, -0.6, 0.0], [0.12, -0.16, -1.0]])
     args = [jnp.array(x) for x in (MEAN, COV, residual, H)]
-    got = ekf.update(*args, jnp.array(R), threshold=threshold, softness=softness)
+    got = ekf.update(*args, jnp.array(R), threshold=threshold, temperature=softness)
     S = H @ COV @ H.T + R
     nis = np.array(residual) @ np.linalg.solve(S, residual)
     weight = max(1 / (1 + math.exp(min((nis - threshold) / softness, 700))), 1e-6)
@@ -315,7 +315,7 @@ def test_a_soft_gate_is_an_update_with_r_over_w(residual, tolerance):
     K = COV @ H.T @ np.linalg.inv(H @ COV @ H.T + loose)
     A = np.eye(3) - K @ H
     error = got.mean - (MEAN + K @ residual)
-    np.testing.assert_allclose(error.at[2].set(motion.wrap(error[2])), 0, rtol=0, atol=tolerance(1e-12, 1e-5))
+    np.testing.assert_allclose(error.at[2].set(se2.wrap(error[2])), 0, rtol=0, atol=tolerance(1e-12, 1e-5))
     np.testing.assert_allclose(got.cov, A @ COV @ A.T + K @ loose @ K.T, rtol=0, atol=tolerance(1e-13, 1e-6))
     np.testing.assert_allclose(got.S, S, rtol=tolerance(1e-12, 1e-5))
     np.testing.assert_allclose(got.nis, nis, rtol=tolerance(1e-10, 1e-3))
@@ -333,7 +333,7 @@ def test_a_soft_gate_leaves_the_belief_where_there_is_nothing_to_weigh(fault, ni
     if fault == "cov":
         cov = np.diag([1.0, -9.0, 1.0])
     args = [jnp.array(x) for x in (mean, cov, residual, np.eye(2, 3), R)]
-    update = ekf.update(*args, threshold=9.5, softness=2.0, valid=fault != "valid")
+    update = ekf.update(*args, threshold=9.5, temperature=2.0, valid=fault != "valid")
     np.testing.assert_array_equal(update.mean, args[0])
     np.testing.assert_array_equal(update.cov, args[1])
     assert not update.accepted

@@ -25,8 +25,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import EpsImagePlugin, Image
-from test_logs import MRCLAM, woods
 from test_checkpoint import ARRAYS, STUDY
+from test_logs import MRCLAM, woods
 
 from jaxlocmap import Params, logs
 from jaxlocmap.logs.matlab import read_matrices

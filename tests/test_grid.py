@@ -395,8 +395,8 @@ def test_gradient_by_pose_and_ranges_is_zero():
 
 # --- scores of a map
 
-entropy_bits, brier = jax.jit(grid.entropy_bits), jax.jit(grid.brier)
-calibration = jax.jit(grid.calibration, static_argnames="bins")
+entropy_bits, brier = jax.jit(quality.entropy_bits), jax.jit(quality.brier)
+calibration = jax.jit(quality.calibration, static_argnames="bins")
 
 
 def test_entropy_of_what_is_not_known_is_a_bit_a_cell(tolerance):
@@ -475,7 +475,7 @@ def test_calibration_is_numpys(tolerance):
 def test_a_probability_on_an_edge_falls_into_the_bin_above():
     """A half, exactly; and a cell that is not to be scored falls into none."""
     where = jnp.array([[True, True, True, False]])
-    sums = grid.score(jnp.zeros((1, 4)), jnp.array([[True, False, True, True]]), where, bins=4)
+    sums = quality.score(jnp.zeros((1, 4)), jnp.array([[True, False, True, True]]), where, bins=4)
     np.testing.assert_array_equal(sums.cells, [0, 0, 3, 0])
     np.testing.assert_array_equal(sums.probability, [0, 0, 1.5, 0])
     np.testing.assert_array_equal(sums.occupied, [0, 0, 2, 0])
@@ -579,8 +579,8 @@ def test_scores_of_many_maps_are_refused_by_name():
     """Their sum would pass for the score of one."""
     one, many = jnp.zeros((4, 4)), jnp.zeros((5, 4, 4))
     with pytest.raises(ValueError, match=r"^log_odds: expected shape \(any, any\), got \(5, 4, 4\)$"):
-        grid.entropy_bits(many)
-    for score in (grid.brier, grid.calibration):
+        quality.entropy_bits(many)
+    for score in (quality.brier, quality.calibration):
         with pytest.raises(ValueError, match=r"^log_odds: expected shape \(any, any\), got \(5, 4, 4\)$"):
             score(many, many > 0, many > 0)
         with pytest.raises(ValueError, match=r"^occupied: expected shape \(4, 4\), got \(5, 4, 4\)$"):

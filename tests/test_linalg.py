@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlocmap._internal.linalg import Matrix, forward, is_psd, ldl, mahalanobis, sandwich, solve, stack
+from jaxlocmap._internal.linalg import Matrix, forward, is_psd, ldl, mahalanobis, quadratic_form, solve, stack
 
 
 def random_psd(rng, n, rank=None):
@@ -34,14 +34,14 @@ def test_products_sums_and_transposes_are_numpys_whatever_is_structure(a, b, c):
 
 def test_structure_leaves_no_trace_in_the_program():
     shear = Matrix([[1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    jaxpr = jax.make_jaxpr(lambda P: sandwich(shear, Matrix.of(P)).array(P.dtype))(jnp.eye(3))
+    jaxpr = jax.make_jaxpr(lambda P: quadratic_form(shear, Matrix.of(P)).array(P.dtype))(jnp.eye(3))
     assert not {"mul", "add", "dot_general"} & {eqn.primitive.name for eqn in jaxpr.eqns}
 
 
-def test_sandwich_is_the_product_and_symmetric_to_the_last_bit(tolerance):
+def test_quadratic_form_is_the_product_and_symmetric_to_the_last_bit(tolerance):
     rng = np.random.default_rng(0)
     A, P = rng.normal(size=(3, 3)), random_psd(rng, 3)
-    result = np.asarray(sandwich(Matrix.of(jnp.array(A)), Matrix.symmetric(jnp.array(P))).array(float))
+    result = np.asarray(quadratic_form(Matrix.of(jnp.array(A)), Matrix.symmetric(jnp.array(P))).array(float))
     np.testing.assert_array_equal(result, result.T)
     np.testing.assert_allclose(result, A @ P @ A.T, rtol=tolerance(1e-13, 1e-5))
 

@@ -156,7 +156,7 @@ def ulps(count):
 
 @given(angle=st.floats(-50.0, 50.0))
 def test_wrap_lands_in_the_circle_on_the_same_angle(angle):
-    wrapped = float(motion.wrap(jnp.array(angle)))
+    wrapped = float(se2.wrap(jnp.array(angle)))
     assert -EDGE - ulps(1) <= wrapped <= EDGE + ulps(1)
     turns = (float(jnp.array(angle)) - wrapped) / (2 * math.pi)
     # An angle of 50 carries 16 times the rounding of pi, and so does the multiple of 2 pi taken off it.
@@ -167,23 +167,23 @@ def test_wrap_lands_in_the_circle_on_the_same_angle(angle):
 def test_wrap_leaves_an_angle_inside_as_it_is(angle):
     angle = jnp.array(angle)
     if 1e-37 < abs(float(angle)) < EDGE - ulps(2):  # XLA flushes subnormal numbers to zero
-        assert float(motion.wrap(angle)) == float(angle)
+        assert float(se2.wrap(angle)) == float(angle)
 
 
 @pytest.mark.parametrize("angle", [-EDGE, EDGE, np.nextafter(EDGE, 0), 3 * EDGE, -3 * EDGE, 5 * EDGE, -7 * EDGE])
 def test_wrap_at_the_seam_is_pi_from_zero(angle):
-    assert abs(abs(float(motion.wrap(jnp.array(angle)))) - EDGE) <= ulps(8)  # 7 pi carries 8 roundings of pi
+    assert abs(abs(float(se2.wrap(jnp.array(angle)))) - EDGE) <= ulps(8)  # 7 pi carries 8 roundings of pi
 
 
 def test_the_circle_is_closed_at_minus_pi_and_open_at_pi():
     for angle in (-EDGE, EDGE):
-        assert float(motion.wrap(jnp.array(angle))) == pytest.approx(-EDGE, abs=ulps(1))
-    assert float(motion.wrap(jnp.array(EDGE - ulps(4)))) > 3
+        assert float(se2.wrap(jnp.array(angle))) == pytest.approx(-EDGE, abs=ulps(1))
+    assert float(se2.wrap(jnp.array(EDGE - ulps(4)))) > 3
 
 
 def test_wrap_has_derivative_one_everywhere():
     for angle in (0.0, 3.0, EDGE, -EDGE, 9.0):
-        assert float(jax.grad(motion.wrap)(jnp.array(angle))) == 1.0
+        assert float(jax.grad(se2.wrap)(jnp.array(angle))) == 1.0
 
 
 @pytest.mark.parametrize("name", ["euler", "arc", "capstone"])

@@ -476,9 +476,9 @@ def test_every_atom_keeps_float32(single):
             "update": ekf.update(mean, cov, residual, H, params.R, threshold=GATE),
             "sensor": [residual, H.array(jnp.float32), sensors.observe(mean, mark, offset)],
             "wheels": [motion.from_wheels(dt, z[0], 0.4), motion.to_wheels(control, 0.4)],
-            "map": [log_odds, grid.probability(log_odds), grid.entropy_bits(log_odds)],
-            "brier": grid.brier(log_odds, occupied, occupied),
-            "calibration": grid.calibration(log_odds, occupied, occupied),
+            "map": [log_odds, grid.probability(log_odds), quality.entropy_bits(log_odds)],
+            "brier": quality.brier(log_odds, occupied, occupied),
+            "calibration": quality.calibration(log_odds, occupied, occupied),
             "end": grid.endpoint_covariance(mean, cov, z[0], z[1], params.R),
         }
 
@@ -672,7 +672,7 @@ def test_a_range_is_one_above_zero_and_a_bearing_any_number():
 @pytest.mark.parametrize("softness", [0.0, 1.0])
 def test_an_observation_whose_covariance_is_none_is_reported_and_not_called_used(softness, course):
     """R = -9 I makes that of the innovation negative."""
-    correct = jax.jit(functools.partial(step.correct, config=course.config(gate_softness=softness)))
+    correct = jax.jit(functools.partial(step.correct, config=course.config(gate_temperature=softness)))
     belief = Gaussian(jnp.array([1.0, 2.0, 0.0]), jnp.eye(3) * 1e-4)
     rest = jnp.array([1.01, 0.01]), jnp.array([2.0, 2.0]), jnp.array(3, jnp.int32), jnp.array(True)
     for R, fine in ((course.params.R, True), (-9 * jnp.eye(2), False)):

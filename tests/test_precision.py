@@ -38,19 +38,19 @@ def outcome():
     with jax.enable_x64(True):
         study = precision.Precision(SHORT, CONFIG)
         noise = simulation.Noise()
-        arguments = (simulation.own_params(noise, SHORT.dt), simulation.room(), noise, SHORT.prior())
+        arguments = (simulation.own_params(noise, SHORT), simulation.room(), noise, SHORT.prior())
         return monte_carlo(study, jax.random.key(0), RUNS, *arguments, keep_runs=True).value
 
 
 def test_the_filter_in_float64_is_the_reference(outcome):
     with jax.enable_x64(True):
         prior, world, noise = SHORT.prior(), simulation.room(), simulation.Noise()
-        params = simulation.own_params(noise, SHORT.dt)
+        params = simulation.own_params(noise, SHORT)
 
         @jax.jit
         def drive(key):
             start_key, key = jax.random.split(key)
-            start = simulation.draw_pose(start_key, prior)
+            start = simulation.draw_state(start_key, prior)
             return simulation.simulate(key, world, noise, start, scenario=SHORT, scan=False)
 
         scene = (*map(np.asarray, (world.landmarks, params.Q, params.R)), math.inf, reference.euler, SHORT.dt)

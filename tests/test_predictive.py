@@ -7,7 +7,7 @@ import pytest
 import reference
 
 from jaxlocmap import GridSpec
-from jaxlocmap.mapping.predictive import BINS, foresee, scan_log_loss
+from jaxlocmap.mapping.predictive import BINS, predict_scans, scan_log_loss
 
 SPEC = GridSpec(origin=(-1.0, -2.0), resolution=0.25, shape=(24, 20), l_min=-3.0, l_max=2.5)
 ANGLES = np.linspace(-1.5, 1.5, 7)
@@ -49,7 +49,7 @@ def foreseen(l_occ, l_free, counted, **kwargs):
     poses, ranges = (jnp.asarray(x, jnp.result_type(float)) for x in drive())
     angles = jnp.asarray(ANGLES, poses.dtype)
     amounts = (jnp.asarray(x, poses.dtype) for x in (l_occ, l_free))
-    return foresee(*amounts, poses, ranges, jnp.asarray(counted), angles, spec=SPEC, **LIMITS, **kwargs)
+    return predict_scans(*amounts, poses, ranges, jnp.asarray(counted), angles, spec=SPEC, **LIMITS, **kwargs)
 
 
 @pytest.mark.parametrize("counted", [np.ones(9, bool), np.arange(9) >= 5])
@@ -105,4 +105,4 @@ def test_shapes_that_do_not_fit_are_named():
     amounts, angles = (jnp.array(0.9), jnp.array(-0.6)), jnp.asarray(ANGLES)
     poses, ranges = (jnp.asarray(x) for x in drive())
     with pytest.raises(ValueError, match=r"ranges: expected shape \(9, 7\), got \(8, 7\)"):
-        foresee(*amounts, poses, ranges[:8], jnp.ones(9, bool), angles, spec=SPEC, **LIMITS)
+        predict_scans(*amounts, poses, ranges[:8], jnp.ones(9, bool), angles, spec=SPEC, **LIMITS)

@@ -176,7 +176,7 @@ def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(expected))
     assert (study.scenario, study.config.motion, study.config.grid) == (scenario, "euler", None)
     assert study.config.gate_probability == 0.9
-    np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), scenario.dt).R)
+    np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), scenario).R)
     assert how["devices"] == jax.local_devices()[:1]
 
 
@@ -197,7 +197,7 @@ def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     scenario = dataclasses.replace(simulation.LOOP, steps=4)
     settings = scenario.config(motion="euler", gate_probability=0.9)
     drove = Recorder((SimpleNamespace(pose=np.full((4, 3), 2.0)), {"inputs": np.ones(4)}))
-    monkeypatch.setattr(consistency.simulate, "simulate", drove)
+    monkeypatch.setattr(consistency.simulation, "simulate", drove)
     ran = Recorder((Mapped(np.full((2, 2), 3.0)), np.full((4, 3), 5.0)))
     monkeypatch.setattr(consistency, "run", lambda params, state, inputs, **how: ran(params.R[0, 0], inputs, **how))
     monkeypatch.setattr(consistency.plotting, "map_figure", figure := Recorder())
@@ -293,7 +293,7 @@ def test_options_of_a_sweep(monkeypatch, tmp_path, options, fields):
 def test_values_of_a_sweep(monkeypatch, tmp_path, plant):
     _, _, _, x, y, params, *_ = swept(monkeypatch, tmp_path, x_values=(1.0, 2.0), y_values=(3.0, 4.0, 5.0))
     assert (x.tolist(), y.tolist()) == ([1, 2], [3, 4, 5])
-    np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), simulation.LOOP.dt).R)
+    np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), simulation.LOOP).R)
     _, _, _, x, y, params, *_ = swept(monkeypatch, tmp_path, y="gate_probability", quick=True, params=plant[0])
     np.testing.assert_allclose(x, 8.0 ** np.linspace(-1, 1, 5), rtol=1e-6)
     np.testing.assert_allclose(y, (0.5, 0.9, 0.99, 0.9999, 1.0), rtol=1e-6)
@@ -401,7 +401,7 @@ def test_the_detector_of_the_course_goes_by_what_it_measures(monkeypatch):
     rolled = Recorder(("truth", SimpleNamespace(_replace=lambda **new: new, valid=np.array([[1, 1], [0, 1]], bool))))
     rolled.answer[1].z = np.array([[[7.4, 0.0], [7.5, 0.0]], [[1.0, 0.0], [2.0, 9.0]]])
     monkeypatch.setattr(capstone, "course_draws", draws := Recorder("draws"))
-    monkeypatch.setattr(capstone.simulate, "roll_out", rolled)
+    monkeypatch.setattr(capstone.simulation, "roll_out", rolled)
     world = simulation.room()
     truth, inputs = capstone.course_drive(17, simulation.CAPSTONE, world)
     assert (truth, inputs["valid"].tolist()) == ("truth", [[True, False], [False, True]])
@@ -418,7 +418,7 @@ def course_report(monkeypatch, tmp_path):
     scenario = dataclasses.replace(
         simulation.CAPSTONE, steps=4, grid=dataclasses.replace(simulation.CAPSTONE.grid, shape=(2, 3))
     )
-    monkeypatch.setattr(capstone.simulate, "CAPSTONE", scenario)
+    monkeypatch.setattr(capstone.simulation, "CAPSTONE", scenario)
     log_odds = np.array([[0.0, 2.0, -1.0], [0.0, 0.0, 3.0]])
     valid = np.array([[1, 1], [1, 0], [1, 1], [0, 0]], bool)
     accepted = np.array([[1, 1], [0, 0], [1, 0], [0, 0]], bool)
@@ -428,7 +428,7 @@ def course_report(monkeypatch, tmp_path):
     occupied = np.array([[1, 1, 0], [1, 1, 1]], bool)
     monkeypatch.setattr(capstone, "course_drive", drove)
     monkeypatch.setattr(capstone, "run", ran)
-    monkeypatch.setattr(capstone.simulate, "occupancy", Recorder(occupied))
+    monkeypatch.setattr(capstone.simulation, "occupancy", Recorder(occupied))
     figures = {name: Recorder() for name in ("trajectory_figure", "map_figure")}
     for name, figure in figures.items():
         monkeypatch.setattr(capstone.plotting, name, figure)

@@ -13,7 +13,7 @@ import pytest
 import reference
 import scipy.stats
 
-from jaxlocmap import Config, Gaussian, GridSpec, motion, simulation
+from jaxlocmap import Config, Gaussian, GridSpec, simulation
 from jaxlocmap._internal import random, trig
 from jaxlocmap.simulation import CAPSTONE, LOOP, Noise, Scenario
 from jaxlocmap.simulation.world import World, occupancy, ray_cast, room
@@ -22,7 +22,7 @@ BOX = (4.5, 4.0, 7.5, 6.5)  # the box in the room: low x, low y, high x, high y,
 SHORT = dataclasses.replace(CAPSTONE, name="short", steps=12, beams=5, sight_period=4)
 FAILURE = 1e-6  # probability with which a statistical bound is missed by a right program
 
-draw_poses = jax.jit(jax.vmap(simulation.draw_pose, in_axes=(0, None)))
+draw_states = jax.jit(jax.vmap(simulation.draw_state, in_axes=(0, None)))
 simulated = jax.jit(simulation.simulate, static_argnames=("scenario", "scan"))
 
 
@@ -36,7 +36,7 @@ def many(seed, count, scenario, *, start=None, scan=False):
     """Drives of `count` keys as NumPy arrays, from starts drawn from the prior unless given."""
     keys = jax.random.split(jax.random.key(seed), count)
     if start is None:
-        starts = draw_poses(jax.random.split(keys[0], count), scenario.prior())
+        starts = draw_states(jax.random.split(keys[0], count), scenario.prior())
     else:
         starts = jnp.broadcast_to(jnp.array(start), (count, 3))
     drives = simulated_by_key_and_start(keys, room(), Noise(), starts, scenario=scenario, scan=scan)
@@ -264,7 +264,7 @@ def test_no_two_uses_of_a_step_share_a_random_number(monkeypatch):
     for k in (0, 1, 2**20, 2**30):
         simulation.draw_drive(words, k, float)
         for j in range(30):
-            simulation.draw_sighting(words, k, j, scenario=scenario, dtype=float)
+            simulation.draw_detection(words, k, j, scenario=scenario, dtype=float)
         simulation.draw_scan(words, k, scenario=scenario, dtype=float)
     assert len(taken) == len({tuple(counter) for counter in taken}) == 4 * (2 + 30 * 3 + CAPSTONE.beams)
 
@@ -273,7 +273,7 @@ def test_the_true_start_has_the_prior_s_mean_and_covariance():
     L = np.array([[0.3, 0, 0], [0.1, 0.2, 0], [-0.05, 0.1, 0.15]])
     prior = Gaussian(jnp.array([1.0, -2.0, 0.5]), jnp.array(L @ L.T))
     count = 20_000
-    poses = np.asarray(draw_poses(jax.random.split(jax.random.key(0), count), prior))
+    poses = np.asarray(draw_states(jax.random.split(jax.random.key(0), count), prior))
     cov = L @ L.T
     reach = scipy.stats.norm.isf(FAILURE / 2)
     assert np.all(np.abs(poses.mean(0) - prior.mean) < reach * np.sqrt(np.diag(cov) / count))
@@ -284,7 +284,7 @@ def test_the_true_start_has_the_prior_s_mean_and_covariance():
 
 def test_the_true_start_s_heading_is_wrapped():
     prior = Gaussian(jnp.array([0.0, 0.0, 3.1]), jnp.diag(jnp.array([0.01, 0.01, 0.25])))
-    headings = draw_poses(jax.random.split(jax.random.key(0), 200), prior)[:, 2]
+    headings = draw_states(jax.random.split(jax.random.key(0), 200), prior)[:, 2]
     assert np.min(headings) < -2
     assert np.all((headings >= -np.pi) & (headings < np.pi))
 
@@ -393,7 +393,7 @@ def test_a_detector_off_the_centre_sees_from_where_it_sits(offset, tolerance):
     for turn in np.linspace(-3, 3, 7):
         mark = pose[:2] + 2.9 * np.array([np.cos(turn), np.sin(turn)])
         to = mark - sensor
-        z, near = simulation.sight(jnp.zeros(2), jnp.array(pose), jnp.array(mark), Noise(), scenario=scenario)
+        z, near = simulation.detect(jnp.zeros(2), jnp.array(pose), jnp.array(mark), Noise(), scenario=scenario)
         assert bool(near) == (np.hypot(*to) < 3)
         np.testing.assert_allclose(z[0], np.hypot(*to), rtol=0, atol=tolerance(1e-12, 1e-5))
         turned = reference.wrap(float(z[1]) - (np.arctan2(to[1], to[0]) - pose[2] - dtheta))
@@ -409,10 +409,10 @@ def test_a_detector_at_the_centre_costs_nothing():
         near = distance < SHORT.sight_range
         reach = distance + Noise().range * draws[0]
         bearing = trig.arctan2(dy, dx) - pose[2] + Noise().bearing * draws[1]
-        return jnp.stack([reach, motion.wrap(bearing)]), near
+        return jnp.stack([reach, se2.wrap(bearing)]), near
 
     args = jnp.zeros(2), jnp.zeros(3), jnp.ones(2)
-    ours = jax.make_jaxpr(lambda *args: simulation.sight(*args, Noise(), scenario=SHORT))(*args)
+    ours = jax.make_jaxpr(lambda *args: simulation.detect(*args, Noise(), scenario=SHORT))(*args)
     assert sorted(eqn.primitive.name for eqn in ours.eqns) == sorted(
         eqn.primitive.name for eqn in jax.make_jaxpr(centred)(*args).eqns
     )
@@ -454,14 +454,14 @@ def test_a_scan_s_noise_comes_after_the_cut_at_its_reach_and_ends_at_its_least_r
     """Nothing but one wall, 0.4 m ahead: beam by beam, what each draw makes of it."""
     around = World(jnp.array([[(0.4, -0.05), (0.4, 0.05)]]), jnp.zeros((0, 2)))
     draws = jnp.array([1.0, -1.0, -2.0, 0.5, -30.0])
-    got = simulation.look_round(draws, jnp.zeros(3), around, Noise(scan=0.1), scenario=OTHER)
+    got = simulation.simulate_scan(draws, jnp.zeros(3), around, Noise(scan=0.1), scenario=OTHER)
     np.testing.assert_allclose(got, [2.1, 1.9, 0.3, 2.05, 0.3], rtol=1e-6)  # the middle one: 0.4 - 0.2 is below 0.3
 
 
 def test_a_landmark_at_the_very_reach_is_not_seen():
     for reach, near in ((3.0, False), (np.nextafter(np.float32(3), np.float32(0)), True)):
         mark = jnp.array([float(reach), 0.0])
-        assert bool(simulation.sight(jnp.zeros(2), jnp.zeros(3), mark, Noise(), scenario=OTHER)[1]) is near
+        assert bool(simulation.detect(jnp.zeros(2), jnp.zeros(3), mark, Noise(), scenario=OTHER)[1]) is near
 
 
 @pytest.mark.parametrize(("drawn", "false"), [(0.29, True), (0.31, False)])
@@ -469,7 +469,7 @@ def test_a_false_sighting_is_made_of_its_own_draws(drawn, false):
     """Anywhere within the robot's own reach, and all around; what is drawn decides whether it is one."""
     draws, noise = jnp.array([1.0, -1.0, drawn, 0.25, 0.875]), Noise(range=0.1, bearing=0.2, outlier_rate=0.3)
     scenario = dataclasses.replace(OTHER, outliers=True)
-    z, near = simulation.sight(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), noise, scenario=scenario)
+    z, near = simulation.detect(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), noise, scenario=scenario)
     assert near
     np.testing.assert_allclose(z, [0.75, 0.75 * np.pi] if false else [2.1, -0.2], rtol=1e-6)
 
@@ -523,8 +523,8 @@ def test_every_word_of_a_key_makes_another_drive():
 SHAPES = {
     "drive": {"draws": (3,), "k": (), "pose": (3,), "heading": (), "v": (), "w": ()},
     "sight": {"draws": (2,), "pose": (3,), "landmark": (2,), "range": (), "bearing": ()},
-    "look_round": {"draws": (5,), "pose": (3,), "segments": (8, 2, 2), "scan": ()},
-    "draw_pose": {"mean": (3,), "cov": (3, 3)},
+    "simulate_scan": {"draws": (5,), "pose": (3,), "segments": (8, 2, 2), "scan": ()},
+    "draw_state": {"mean": (3,), "cov": (3, 3)},
     "simulate": {"start": (3,), "segments": (8, 2, 2), "landmarks": (4, 2), "v": ()},
 }
 
@@ -536,11 +536,11 @@ def test_a_batch_is_refused_by_name(atom, name):
         noise = Noise(**{key: some.pop(key) for key in Noise._fields if key in some})
         world = World(some.pop("segments", jnp.ones((8, 2, 2))), some.pop("landmarks", jnp.ones((4, 2))))
         around = {"scenario": SHORT, "noise": noise}
-        if atom in ("simulate", "look_round"):
+        if atom in ("simulate", "simulate_scan"):
             around["world"] = world
         if atom == "simulate":
             around["key"] = jax.random.key(0)
-        if atom == "draw_pose":
+        if atom == "draw_state":
             some, around = {"prior": Gaussian(**some)}, {"key": jax.random.key(0)}
         with pytest.raises(ValueError, match=rf"^(noise\.)?{name}: expected shape .*, got {re.escape(str(wrong))}"):
             getattr(simulation, atom)(**some, **around)
@@ -549,7 +549,7 @@ def test_a_batch_is_refused_by_name(atom, name):
 def test_draws_for_another_detector_or_another_drive_are_refused():
     args = jnp.zeros(3), jnp.ones(2), Noise()
     with pytest.raises(ValueError, match=r"^draws: expected shape \(5\), got \(2,\)$"):
-        simulation.sight(jnp.zeros(2), *args, scenario=FALSE)
+        simulation.detect(jnp.zeros(2), *args, scenario=FALSE)
     draws = simulation.Draws(jnp.zeros((13, 3)), jnp.zeros((12, 4, 2)))
     with pytest.raises(ValueError, match=r"^draws\.drive: expected shape \(12, 3\), got \(13, 3\)$"):
         simulation.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
@@ -571,8 +571,8 @@ def test_random_numbers_are_those_of_one_step_and_one_landmark(steps):
     kind = {"scenario": SHORT, "dtype": float}
     for name, draw in (
         ("k", lambda: simulation.draw_drive(words, many, float)),
-        ("k", lambda: simulation.draw_sighting(words, many, one, **kind)),
-        ("j", lambda: simulation.draw_sighting(words, one, many, **kind)),
+        ("k", lambda: simulation.draw_detection(words, many, one, **kind)),
+        ("j", lambda: simulation.draw_detection(words, one, many, **kind)),
         ("k", lambda: simulation.draw_scan(words, many, **kind)),
     ):
         with pytest.raises(ValueError, match=rf"^{name}: expected shape \(\), got {re.escape(str(steps))}$"):
@@ -603,8 +603,8 @@ def sighted(distance, noise, *, scenario, count):
     pose, landmark = jnp.zeros(3), jnp.stack([distance, jnp.zeros_like(distance)])
 
     def one(k):
-        draws = simulation.draw_sighting(words, k, 2, scenario=scenario, dtype=float)
-        return simulation.sight(draws, pose, landmark, noise, scenario=scenario)
+        draws = simulation.draw_detection(words, k, 2, scenario=scenario, dtype=float)
+        return simulation.detect(draws, pose, landmark, noise, scenario=scenario)
 
     return jax.vmap(one)(jnp.arange(count))
 

@@ -256,7 +256,7 @@ def played(*args, scenario, config):
 
     def one(key, params, world, noise, prior):
         start_key, key = jax.random.split(key)
-        start = prior.mean if scenario.exact_prior else simulation.draw_pose(start_key, prior)
+        start = prior.mean if scenario.exact_prior else simulation.draw_state(start_key, prior)
         mapping = config.grid is not None
         truth, inputs = simulation.simulate(key, world, noise, start, scenario=scenario, scan=mapping)
         scene = {"landmarks": world.landmarks, "beam_angles": scenario.beam_angles(), "config": config}
@@ -896,7 +896,7 @@ def test_a_filter_that_is_told_the_truth_differs_in_nothing_else():
     noise = Noise(heading=0.01, v=0.03, w=0.02, range=0.1, bearing=0.05)
     study, params = reference_study(SHORT, config, noise)
     assert study == Study(SHORT, dataclasses.replace(config, motion="euler", grid=None))
-    jax.tree.map(np.testing.assert_array_equal, params, simulation.own_params(noise, SHORT.dt))
+    jax.tree.map(np.testing.assert_array_equal, params, simulation.own_params(noise, SHORT))
 
 
 def test_what_such_a_filter_shows_is_in_the_report():

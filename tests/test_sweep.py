@@ -99,7 +99,7 @@ def settings():
 
 def shared():
     noise = simulation.Noise()
-    return simulation.own_params(noise, SHORT.dt), simulation.room(), noise, SHORT.prior()
+    return simulation.own_params(noise, SHORT), simulation.room(), noise, SHORT.prior()
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from test_localize import made_log
 
 from jaxlocmap import Config, Gaussian, Params, simulation, tuning
 from jaxlocmap.logs import Log
-from jaxlocmap.mapping.predictive import Foresight
+from jaxlocmap.mapping.predictive import PredictiveScore
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import tune
@@ -69,12 +69,12 @@ def test_a_scenario_is_tuned_validated_and_judged_on_drives_of_their_own(scene):
     assert (source.name, source.dt) == ("loop, euler motion, 40 runs", 0.1)
     assert (source.train, source.compared, source.validation) == ("batch of 40", "batch of 40", "batch of 10")
     config = source.config
-    assert (config.motion, config.gate_probability, config.gate_softness, config.grid) == ("euler", 0.999, 2.0, None)
+    assert (config.motion, config.gate_probability, config.gate_temperature, config.grid) == ("euler", 0.999, 2.0, None)
     np.testing.assert_array_equal(source.start.R, simulation.course_params().R)
     assert source.evidence(START) == {"anees": 3.0}
     ((study, key, runs, params, *_), _) = scene.monte_carlo.calls[0]
     assert (study.scenario, study.config.motion, study.config.gate_probability) == (simulation.LOOP, "euler", 0.9)
-    assert (runs, study.config.gate_softness, study.config.grid) == (70, 0, None)
+    assert (runs, study.config.gate_temperature, study.config.grid) == (70, 0, None)
     assert (params.R.dtype, scene.summarise.calls) == (np.float32, [(("totals", study.config), {})])
     np.testing.assert_allclose(params.R, START.R, rtol=1e-6)
     first = [key_data(jax.random.split(jax.random.fold_in(jax.random.key(3), i))[0]) for i in (0, 1)]
@@ -135,7 +135,7 @@ def test_woods_is_tuned_on_its_first_half_and_judged_on_its_second(robots):
     source = woods(robots)
     assert source.name == "woods.mat, first half"
     assert source.config == Config(
-        dt=0.1, motion="euler", gate_probability=0.999, gate_softness=2.0, sensor_offset=(0.2, 0.1, 0.3)
+        dt=0.1, motion="euler", gate_probability=0.999, gate_temperature=2.0, sensor_offset=(0.2, 0.1, 0.3)
     )
     counted, known = np.asarray(source.train.counted), np.asarray(source.train.known)
     # 35 steps from the first truth on: 17 to tune on, in six windows, of which the fifth is to validate by.
@@ -156,7 +156,7 @@ def test_woods_is_tuned_on_its_first_half_and_judged_on_its_second(robots):
     np.testing.assert_allclose(prior.mean, [2.2, 4.4, 0.22], rtol=1e-6)
     assert len(inputs.dt) == 18
     np.testing.assert_array_equal(landmarks, made_log().landmarks)
-    assert (config.gate_probability, config.gate_softness, config.motion) == (0.9, 0, "euler")
+    assert (config.gate_probability, config.gate_temperature, config.motion) == (0.9, 0, "euler")
     assert config.sensor_offset == (0.2, 0.1, 0.3)
     ((log, timeline, info, same), _) = robots.judged.calls[0]
     assert (log, info, same) == (robots.logs[None], "info", config)
@@ -295,7 +295,7 @@ def test_runs_of_scans_validate_in_a_long_log(monkeypatch):
 
 
 def test_what_is_foreseen_is_averaged_over_cells(monkeypatch):
-    sums = Foresight(
+    sums = PredictiveScore(
         log_loss=np.array(6.0),
         cells=np.array(8.0),
         bin_cells=np.array([4.0, 0.0, 4.0]),
@@ -344,7 +344,7 @@ def test_what_is_tuned_is_what_the_losses_depend_on(options, expected):
 
 
 def test_losses_weigh_what_they_are_told():
-    assert tune_options.loss_weights(tune.TuneConfig(loss=("pose", "nees=0.25"))) == (("pose", 1.0), ("nees", 0.25))
+    assert tune_options.loss_weights(tune.TuneConfig(loss=("pose", "nees=0.25"))) == (("pose_nll", 1.0), ("nees", 0.25))
 
 
 LOG = {"log": Path("a.log")}
@@ -436,7 +436,7 @@ def test_the_whole_program(monkeypatch, tmp_path):
     """Tunes on one part, is sure by what is compared, and judges what is held out before and after."""
     own = Params.from_std(v=0.5, w=0.6, range=0.7, bearing=0.8)
     judged = Recorder()
-    sure = tuning.Certainty(
+    sure = tuning.StandardErrors(
         ("range", "v"),
         np.array([0.3, 0.1]),
         np.array([0.03, 0.01]),

@@ -11,7 +11,7 @@ from drives import ONLY_POSES, OWN, SHORT, drives
 from jaxlocmap import Gaussian, Inputs, simulation, tuning
 from jaxlocmap.simulation.world import random_room
 
-OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation", 1.0), ("pose", 1.0)))
+OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation_nll", 1.0), ("pose_nll", 1.0)))
 
 
 @jax.jit
@@ -275,7 +275,7 @@ def test_a_start_that_is_not_exact_is_drawn_from_the_prior_with_half_of_the_run_
     still = dataclasses.replace(SHORT, name="still", steps=1, dt=1e-9, exact_prior=False)
     batch = tuning.simulated(jax.random.key(5), 8, simulation.room(), simulation.Noise(), scenario=still)
     draw = jax.jit(
-        jax.vmap(lambda key, prior: simulation.draw_pose(jax.random.split(key)[0], prior), in_axes=(0, None))
+        jax.vmap(lambda key, prior: simulation.draw_state(jax.random.split(key)[0], prior), in_axes=(0, None))
     )
     starts = draw(jax.random.split(jax.random.key(5), 8), still.prior())
     np.testing.assert_allclose(batch.truth[:, 0, :2], starts[:, :2], rtol=0, atol=1e-5)

@@ -14,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 
 from jaxlocmap import Gaussian, Params, simulation, tuning
 
-OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation", 1.0),))
+OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation_nll", 1.0),))
 START = simulation.course_params()
 
 
@@ -26,8 +26,8 @@ def test_it_finds_the_robots_own_noise(x64):
     lying = dataclasses.replace(SHORT, name="lying", steps=40, outliers=True)
     noise = simulation.Noise(outlier_rate=0.05)
     batch = tuning.simulated(jax.random.key(4), 400, simulation.room(), noise, scenario=lying)
-    soft = dataclasses.replace(ONLY_POSES, gate_softness=2.0)
-    fit = tuning.fit(tuning.Objective(soft, (("innovation", 1.0),)), START, batch)
+    soft = dataclasses.replace(ONLY_POSES, gate_temperature=2.0)
+    fit = tuning.fit(tuning.Objective(soft, (("innovation_nll", 1.0),)), START, batch)
     found, own = ({k: float(x) for k, x in tuning.natural(params).items()} for params in (fit.params, OWN))
     known = 4 / math.sqrt(2 * float(np.sum(np.asarray(batch.inputs.valid))))
     for name in ("range", "bearing"):

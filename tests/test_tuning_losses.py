@@ -12,7 +12,7 @@ import scipy.stats
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives
 
 from jaxlocmap import Params, simulation, tuning
-from jaxlocmap.mapping.predictive import Foresight
+from jaxlocmap.mapping.predictive import PredictiveScore
 from jaxlocmap.tuning import losses
 from jaxlocmap.tuning.filtering import check_batch, filtered
 from jaxlocmap.tuning.losses import LOSSES
@@ -120,7 +120,7 @@ def test_the_map_is_mapped_where_it_is_told(tolerance):
     assert alone("map", OTHER, blind, CONFIG) == pytest.approx(exact, rel=tolerance(1e-13, 1e-6))
 
 
-@pytest.mark.parametrize("names", [("innovation", "pose", "state", "nees", "nis"), ("map",)])
+@pytest.mark.parametrize("names", [("innovation_nll", "pose", "state", "nees", "nis"), ("map",)])
 def test_gradients_are_what_differences_give(names, x64):
     config, tuned = (CONFIG, tuning.SENSOR_MODEL) if names == ("map",) else (ONLY_POSES, tuning.FULL_NOISE)
     objective, batch = tuning.Objective(config, tuple((name, 1.0) for name in names)), drives()
@@ -146,7 +146,7 @@ def with_one_false_reading(metres):
 def test_a_refused_observation_pays_what_an_outlier_pays(tolerance):
     (far, count), (further, _) = with_one_false_reading(3.0), with_one_false_reading(4.0)
     (good, _), price = with_one_false_reading(0.0), math.log(2 * math.pi * ONLY_POSES.max_range / 0.01)
-    costs = [alone("innovation", OWN, batch) * count for batch in (good, far, further)]
+    costs = [alone("innovation_nll", OWN, batch) * count for batch in (good, far, further)]
     assert costs[1] == pytest.approx(costs[2], rel=tolerance(1e-9, 1e-5))  # bounded: as far off as you please
     best = -max(float(x) for x in np.ravel(filtered_log_likelihood(good)))
     assert costs[1] - costs[0] < price - best + 1
@@ -163,7 +163,7 @@ def filtered_log_likelihood(batch):
 def test_to_refuse_everything_is_no_way_to_win():
     batch = drives(scans=False)
     certain = OWN._replace(Q=OWN.Q * 1e-4, R=OWN.R * 1e-4)  # nothing passes the gate after the first
-    for loss in ("innovation", "nis"):
+    for loss in ("innovation_nll", "nis"):
         assert alone(loss, certain, batch) > alone(loss, OWN, batch) + 1
 
 
@@ -179,8 +179,8 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     places, weights = np.polynomial.legendre.leggauss(6)
     missed = {}
     for softness in (0.0, 2.0):
-        config = dataclasses.replace(ONLY_POSES, gate_softness=softness)
-        objective = tuning.Objective(config, (("innovation", 1.0),))
+        config = dataclasses.replace(ONLY_POSES, gate_temperature=softness)
+        objective = tuning.Objective(config, (("innovation_nll", 1.0),))
         f = lambda at, batch, objective=objective: objective(tuning.constrain(own | at), batch)  # noqa: E731
         places_w = own["w"] + h * jnp.asarray([-1, *places, 1])
         value, slope = jax.jit(jax.vmap(lambda w, f=f: jax.jvp(lambda w: f({"w": w}, batch)[0], (w,), (1.0,))))(
@@ -195,15 +195,15 @@ def test_the_map_is_told_the_configuration_and_the_batch(monkeypatch):
     """Each sequence with its own poses, ranges and count, and the limits of the laser by their names."""
     told = []
 
-    def foresee(l_occ, l_free, poses, ranges, counted, beam_angles, **limits):
+    def predict_scans(l_occ, l_free, poses, ranges, counted, beam_angles, **limits):
         told.append((limits, beam_angles))
         total = l_occ + 2 * l_free + jnp.sum(poses) + jnp.sum(ranges) + jnp.sum(jnp.where(counted, 1.0, 0.0))
-        return Foresight(total, jnp.sum(jnp.where(counted, 1.0, 0.0)), *[jnp.zeros(3)] * 3)
+        return PredictiveScore(total, jnp.sum(jnp.where(counted, 1.0, 0.0)), *[jnp.zeros(3)] * 3)
 
     monkeypatch.setattr(losses, "foresee", foresee)
     batch = some_of(drives())
     config = dataclasses.replace(CONFIG, min_range=0.3, max_range=7.0)
-    got = losses.foreseen(jnp.array(0.5), jnp.array(-0.25), batch, batch.truth, config=config, bins=True)
+    got = losses.predictive_score(jnp.array(0.5), jnp.array(-0.25), batch, batch.truth, config=config, bins=True)
     counted = np.asarray(batch.counted).sum(1)
     rest = np.asarray(batch.truth).sum((1, 2)) + np.asarray(batch.inputs.ranges).sum((1, 2))
     np.testing.assert_allclose(got.log_loss, counted + rest, rtol=1e-4)
@@ -217,7 +217,7 @@ def test_the_map_is_told_the_configuration_and_the_batch(monkeypatch):
     ):
         args = {"batch": batch, "config": CONFIG} | missing
         with pytest.raises(ValueError, match=r"loss `map`: expected config\.grid, batch\.inputs\.ranges and"):
-            losses.foreseen(jnp.array(0.5), jnp.array(-0.25), args["batch"], batch.truth, config=args["config"])
+            losses.predictive_score(jnp.array(0.5), jnp.array(-0.25), args["batch"], batch.truth, config=args["config"])
 
 
 def test_a_map_has_no_slope_by_the_poses(monkeypatch):
@@ -226,7 +226,7 @@ def test_a_map_has_no_slope_by_the_poses(monkeypatch):
 
     def foreseen(l_occ, l_free, batch, poses, **_):
         each = l_occ * jnp.sum(poses, axis=(1, 2))
-        return Foresight(each, jnp.ones(4), *[jnp.zeros(3)] * 3)
+        return PredictiveScore(each, jnp.ones(4), *[jnp.zeros(3)] * 3)
 
     monkeypatch.setattr(losses, "filtered", filtered)
     monkeypatch.setattr(losses, "foreseen", foreseen)
@@ -259,7 +259,7 @@ def test_what_lies_in_steps_that_do_not_count_is_nothing_to_tune_on():
         some = jnp.broadcast_to(jnp.asarray(half), (4, 12))
         unseen = batch.inputs._replace(valid=jnp.asarray(valid & ~half[:, None]))
         refused("expected an observation for the loss `nis`, got none", (("nis", 1.0),), counted=some, inputs=unseen)
-        refused("a step with a known pose for the loss `state`", (("state", 1.0),), counted=some, known=~some)
+        refused("a step with a known pose for the loss `state`", (("mse", 1.0),), counted=some, known=~some)
     refused("expected scans", (("map", 1.0),), config=CONFIG, beam_angles=None)
 
 
@@ -273,13 +273,13 @@ def test_a_gate_that_lets_in_only_what_does_not_count():
     refused(f"the gate refuses all {count} observations", counted=counted, inputs=batch.inputs._replace(z=z))
 
 
-def refused(match, objective=(("innovation", 1.0),), params=OWN, config=ONLY_POSES, **changes):
+def refused(match, objective=(("innovation_nll", 1.0),), params=OWN, config=ONLY_POSES, **changes):
     with pytest.raises(ValueError, match=match):
         tuning.Objective(config, objective).check(params, drives()._replace(**changes))
 
 
 def test_a_log_without_truth():
-    refused("the true poses, which the loss `pose` needs, got None", (("pose", 1.0),), truth=None)
+    refused("the true poses, which the loss `pose` needs, got None", (("pose_nll", 1.0),), truth=None)
     nowhere = jnp.zeros_like(drives().known)
     refused("a step with a known pose for the loss `nees`, got none", (("nees", 1.0),), known=nowhere)
 
@@ -308,7 +308,7 @@ def test_a_start_that_is_not_finite():
     prior = drives().prior._replace(cov=jnp.asarray(covs))
     refused(
         "loss `pose`: expected a finite value at the start, got none for 1 of 4 sequences, the first being number 2",
-        (("pose", 1.0),),
+        (("pose_nll", 1.0),),
         prior=prior,
     )
 
@@ -321,7 +321,7 @@ def test_a_start_that_is_not_finite():
         ((("pose", 0.0),), "weight of pose: expected a positive number, got 0.0"),
         ((("pose", math.nan),), "weight of pose"),
         ((("pose", math.inf),), "weight of pose"),
-        ((("pose", 1.0), ("nis", -1.0)), "weight of nis: expected a positive number, got -1.0"),
+        ((("pose_nll", 1.0), ("nis", -1.0)), "weight of nis: expected a positive number, got -1.0"),
         ((("map", 1.0),), "config.grid: expected the GridSpec"),
     ],
 )
@@ -332,7 +332,7 @@ def test_an_objective_that_is_none(weights, message):
 
 def test_a_batch_that_does_not_fit_is_named():
     with pytest.raises(ValueError, match=r"batch.truth: expected shape \(4, 12, 3\), got \(4, 11, 3\)"):
-        losses.pose(OWN, drives()._replace(truth=drives().truth[:, :11]), config=ONLY_POSES)
+        losses.pose_nll(OWN, drives()._replace(truth=drives().truth[:, :11]), config=ONLY_POSES)
     batch = drives()
     for name, change in {
         "counted": {"counted": batch.counted[0]},

@@ -13,9 +13,9 @@ from jaxlocmap.tuning.standard_errors import _judge
 NAMES = ("w", "range")
 
 
-def test_it_is_the_sandwich_of_differences(x64):
+def test_it_is_the_quadratic_form_of_differences(x64):
     """Of a sum of losses, one of which is no mean over sequences."""
-    objective = tuning.Objective(ONLY_POSES, (("nis", 1.0), ("innovation", 5.0)))
+    objective = tuning.Objective(ONLY_POSES, (("nis", 1.0), ("innovation_nll", 5.0)))
     batch, h = drives(scans=False), 1e-4
     whole = tuning.unconstrain(OWN)
     sums = jax.jit(lambda x: objective.tallies(tuning.constrain(whole | dict(zip(NAMES, x, strict=True))), batch))
@@ -34,7 +34,7 @@ def test_it_is_the_sandwich_of_differences(x64):
     at, none = np.array([float(whole[name]) for name in NAMES]), np.zeros(4)
     hessian = np.stack([(gradient(at + d, none) - gradient(at - d, none)) / 2e-3 for d in 1e-3 * np.eye(2)])
     influence = np.stack([(gradient(at, e) - gradient(at, -e)) / 2e-3 for e in 1e-3 * np.eye(4)])
-    sure = tuning.certainty(objective, OWN, batch, (*NAMES, "l_occ"))
+    sure = tuning.standard_errors(objective, OWN, batch, (*NAMES, "l_occ"))
     assert "l_occ: the loss does not depend on it here" in sure.words
     assert np.isinf(sure.standard_error[2])
     np.testing.assert_allclose(sure.hessian[:2, :2], hessian, rtol=1e-3, atol=1e-4 * np.abs(hessian).max())
@@ -166,10 +166,10 @@ def test_errors_and_intervals_are_those_written_out(n):
 
 def test_one_sequence_has_nothing_to_compare_with():
     one = tuning.pick(drives(), slice(0, 1))
-    objective = tuning.Objective(ONLY_POSES, (("innovation", 1.0),))
+    objective = tuning.Objective(ONLY_POSES, (("innovation_nll", 1.0),))
     with pytest.raises(ValueError, match="at least two sequences to compare, got 1"):
-        tuning.certainty(objective, OWN, one, NAMES)
+        tuning.standard_errors(objective, OWN, one, NAMES)
     with pytest.raises(ValueError, match="tuned: expected some of"):
-        tuning.certainty(objective, OWN, drives(), ())
+        tuning.standard_errors(objective, OWN, drives(), ())
     with pytest.raises(ValueError, match="two equations"):
-        tuning.certainty(tuning.Objective(ONLY_POSES, (("nis", 1.0),)), OWN, drives(), tuning.NOISE)
+        tuning.standard_errors(tuning.Objective(ONLY_POSES, (("nis", 1.0),)), OWN, drives(), tuning.NOISE)

@@ -157,7 +157,7 @@ def test_a_grid_that_cannot_be_is_refused(change, message):
             for p in (0.0, 1.0, -1.0, 2.0, math.nan)
         ),
         *(
-            ({"gate_softness": s}, rf"gate_softness: expected a finite width >= 0, got {s}")
+            ({"gate_temperature": s}, rf"gate_temperature: expected a finite width >= 0, got {s}")
             for s in (-1.0, math.inf, math.nan)
         ),
         ({"sensor_offset": (0.1, 0.2)}, r"sensor_offset: expected finite \(dx, dy, dtheta\), got \(0\.1, 0\.2\)"),
@@ -221,7 +221,7 @@ def test_dtype_checks_see_through_jit():
         (GridSpec, {"origin": ("0", 1.0)}, "origin: expected a number, got '0'"),
         (Config, {"dt": None}, "dt: expected a number, got None"),
         (Config, {"dt": True}, "dt: expected a number, got True"),
-        (Config, {"gate_softness": "2"}, "gate_softness: expected a number, got '2'"),
+        (Config, {"gate_temperature": "2"}, "gate_temperature: expected a number, got '2'"),
         (Config, {"min_range": None}, "min_range: expected a number, got None"),
         (Config, {"max_range": [8.0]}, r"max_range: expected a number, got \[8\.0\]"),
         (GridSpec, {"l_min": None}, "l_min: expected a number, got None"),
@@ -289,7 +289,7 @@ def test_settings_that_are_not_given_are_those_written_beside_them():
         dt=0.1,
         motion="arc",
         gate_probability=0.99,
-        gate_softness=0.0,
+        gate_temperature=0.0,
         sensor_offset=(0.0, 0.0, 0.0),
         grid=None,
         min_range=0.05,

@@ -1,4 +1,4 @@
-"""Loops and branches that run well under `vmap`, and constants that fit beside values under `shard_map`."""
+"""Loops and branches that run well under `vmap` and compile under `shard_map`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
 
-from jaxlocmap._internal.linalg import stack
+from jaxlocmap._internal.linalg import SMALL, stack_scalars
 
 RUNS = "runs"  # the name of the axis of a chunk's runs
-_SMALL = 9  # entries: up to here an array is taken apart, such as the covariance of a pose
 
 
 @custom_vmap
@@ -40,20 +39,6 @@ def sum_over_runs(tree: Any, counted: jax.Array) -> Any:
     of one value a run.
     """
     return jax.tree.map(lambda x: jax.lax.psum(jnp.where(counted, x, 0), RUNS), tree)
-
-
-def zero_like_any(*trees: Any) -> jax.Array:
-    """An int32 zero that differs between devices, as far as `shard_map` is concerned, if any of these values may.
-
-    `shard_map` wants both branches of a `cond`, and the carry before and after a step, to agree on that; a plain
-    constant agrees with nothing. Add this to it. The compiler sees the zero and drops the addition.
-    """
-    total = jnp.zeros((), jnp.int32)
-    for leaf in jax.tree.leaves(trees):
-        if jnp.size(leaf):
-            first = jnp.ravel(leaf)[0]
-            total = total + jnp.where(first == first, 0, 0).astype(jnp.int32)
-    return total
 
 
 def at_once(many: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
@@ -96,56 +81,84 @@ def at_once(many: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
     return one
 
 
-def apart(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
-    """A tree as a list in which every small array stands entry by entry, and the way back.
+def unstack(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
+    """A tree as a list in which every small vector and matrix stands entry by entry, and the function that stacks them
+    again.
 
     A batch of 3x3 matrices lies in memory matrix by matrix, so that arithmetic on one entry strides. Entry by entry,
     each lies there run beside run, which is what vector instructions want. A loop or branch fixes what lies where.
     """
     leaves, structure = jax.tree.flatten(tree)
     leaves = [jnp.asarray(leaf) for leaf in leaves]
-    shapes = [leaf.shape if leaf.ndim in (1, 2) and 0 < leaf.size <= _SMALL else () for leaf in leaves]
-    parts = [leaf[i] if shape else leaf for leaf, shape in zip(leaves, shapes, strict=True) for i in np.ndindex(shape)]
+    shapes = [
+        leaf.shape if leaf.ndim in (1, 2) and 0 < min(leaf.shape) <= max(leaf.shape) <= SMALL else () for leaf in leaves
+    ]
+    scalars = [
+        leaf[i] if shape else leaf for leaf, shape in zip(leaves, shapes, strict=True) for i in np.ndindex(shape)
+    ]
 
-    def together(parts: list[Any]) -> Any:
-        following, whole = iter(parts), []
+    def stack(scalars: list[Any]) -> Any:
+        following, whole = iter(scalars), []
         for shape in shapes:
             some = [next(following) for _ in range(int(np.prod(shape)))]
             if len(shape) == 2:
                 some = [some[i : i + shape[1]] for i in range(0, len(some), shape[1])]
-            whole.append(stack(some) if shape else some[0])
+            whole.append(stack_scalars(some) if shape else some[0])
         return jax.tree.unflatten(structure, whole)
 
-    return parts, together
+    return scalars, stack
 
 
-def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any) -> tuple[Any, Any]:
-    """`jax.lax.scan`, whose carry and results it keeps `apart`."""
-    parts, together = apart(carry)
+def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any, *, unroll: int = 1) -> tuple[Any, Any]:
+    """`jax.lax.scan` whose carry and results are unstacked, and whose first carry may be a constant in `shard_map`."""
+    if _in_shard_map():
+        first = jax.tree.map(lambda x: x[0], xs)
+        carry = _vary(carry, (xs, body(carry, first)))
+    scalars, stack = unstack(carry)
     outputs: list[Callable[[list[Any]], Any]] = []
 
-    def turn(parts: list[Any], x: Any) -> tuple[list[Any], list[Any]]:
-        carry, y = body(together(parts), x)
-        y, way_back = apart(y)
-        outputs.append(way_back)
-        return apart(carry)[0], y
+    def turn(scalars: list[Any], x: Any) -> tuple[list[Any], list[Any]]:
+        carry, y = body(stack(scalars), x)
+        y, stack_y = unstack(y)
+        outputs.append(stack_y)
+        return unstack(carry)[0], y
 
-    parts, ys = jax.lax.scan(turn, parts, xs)
-    return together(parts), jax.vmap(outputs[-1])(ys) if ys else outputs[-1](ys)
+    scalars, ys = jax.lax.scan(turn, scalars, xs, unroll=unroll)
+    return stack(scalars), jax.vmap(outputs[-1])(ys) if ys else outputs[-1](ys)
 
 
 def cond(predicate: jax.Array, true: Callable[..., Any], false: Callable[..., Any], *operands: Any) -> Any:
-    """`jax.lax.cond`, which hands operands in and results out `apart`."""
-    parts, together = apart(operands)
+    """`jax.lax.cond` with operands and results unstacked, whose branches may return constants in `shard_map`."""
+    alike = (operands, true(*operands), false(*operands)) if _in_shard_map() else None
+    scalars, stack = unstack(operands)
     outputs: list[Callable[[list[Any]], Any]] = []
 
     def branch(function: Callable[..., Any]) -> Callable[[list[Any]], list[Any]]:
-        def run(parts: list[Any]) -> list[Any]:
-            results, way_back = apart(function(*together(parts)))
-            outputs.append(way_back)
-            return results
+        def run(scalars: list[Any]) -> list[Any]:
+            result = function(*stack(scalars))
+            scalars, stack_result = unstack(result if alike is None else _vary(result, alike))
+            outputs.append(stack_result)
+            return scalars
 
         return run
 
-    results = jax.lax.cond(predicate, branch(true), branch(false), parts)
+    results = jax.lax.cond(predicate, branch(true), branch(false), scalars)
     return outputs[-1](results)
+
+
+def _in_shard_map() -> bool:
+    return bool(jax.sharding.get_abstract_mesh().manual_axes)
+
+
+def _vary(tree: Any, like: Any) -> Any:
+    """The same values, which differ between devices as far as `shard_map` is concerned wherever any of `like` may.
+
+    `shard_map` wants both branches of a `cond`, and the carry before and after a step, to agree on that, and a constant
+    agrees with nothing. What is added is zero, which the compiler sees, together with what it was computed from.
+    """
+    zero = jnp.zeros((), jnp.int32)
+    for leaf in jax.tree.leaves((tree, like)):
+        if jnp.size(leaf):
+            first = jnp.ravel(leaf)[0]
+            zero = zero + jnp.where(first == first, 0, 0).astype(jnp.int32)
+    return jax.tree.map(lambda x: jnp.logical_or(x, zero != 0) if x.dtype == bool else x + zero.astype(x.dtype), tree)

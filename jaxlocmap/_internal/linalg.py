@@ -7,6 +7,7 @@ Entries that are the Python integers 0, 1 and -1 are structure: products with th
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -16,8 +17,10 @@ import numpy as np
 
 Scalar = Any  # a Python number or an array of shape ()
 
+SMALL = 9  # the largest dimension that is unrolled: above, programs grow faster than they gain
 
-def stack(entries: Any) -> jax.Array:
+
+def stack_scalars(entries: Any) -> jax.Array:
     """Scalars as an array: (n,) from a sequence of them, (n, m) from a sequence of rows.
 
     A later `array[i, j]` then costs nothing under `vmap`: the compiler sees through concatenations, though not through
@@ -86,7 +89,7 @@ class Matrix:
 
     def array(self, dtype: Any) -> jax.Array:
         """The same matrix as an array of shape (n, m)."""
-        return stack([[jnp.asarray(x, dtype) for x in row] for row in self.rows])
+        return stack_scalars([[jnp.asarray(x, dtype) for x in row] for row in self.rows])
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,7 +135,7 @@ def values(tree: Any) -> tuple[list[Scalar], Callable[..., Any]]:
     return [x for x in leaves if not isinstance(x, int)], rebuild
 
 
-def sandwich(A: Matrix, P: Matrix) -> Matrix:
+def quadratic_form(A: Matrix, P: Matrix) -> Matrix:
     """A P Aᵀ for symmetric P: the upper triangle is computed, the lower mirrors it.
 
     A compiler that evaluates a mirrored entry twice may round the copies apart. That does not feed back: the filter
@@ -182,17 +185,46 @@ def mahalanobis(S: Matrix, r: tuple[Scalar, ...]) -> Scalar:
     return sum(v * v / d for v, d in zip(y, D, strict=True))
 
 
-def is_psd(P: Matrix) -> Scalar:
-    """Whether a symmetric 3x3 matrix is finite and positive semi-definite, up to rounding.
+def block_diagonal(*blocks: Matrix) -> Matrix:
+    """Blocks along the diagonal, zero elsewhere."""
+    size, rows = sum(block.shape[1] for block in blocks), []
+    for block in blocks:
+        before = len(rows)
+        rows += [(0,) * before + row + (0,) * (size - before - len(row)) for row in block.rows]
+    return Matrix(rows)
 
-    Sylvester's criterion on the principal minors, each against the product of its diagonal, so that the answer
-    does not depend on units.
+
+def is_psd(P: jax.Array) -> jax.Array:
+    """Whether a symmetric (n, n) matrix is finite and positive semi-definite, up to rounding: () bool.
+
+    P plus a few roundings of its diagonal has no negative pivot, so that the answer does not depend on units. A pivot
+    of zero is one only if what remains of its row is zero too.
     """
-    a, b, c = P[0, 0], P[1, 1], P[2, 2]
-    slack = 1 - 64 * jnp.finfo(jnp.result_type(a)).eps
-    ab, ac, bc = P[0, 1] * P[0, 1], P[0, 2] * P[0, 2], P[1, 2] * P[1, 2]
-    det_gap = a * bc + b * ac + c * ab - 2 * P[0, 1] * P[0, 2] * P[1, 2]  # a b c minus the determinant
-    finite = jnp.isfinite(a + b + c)  # with the minors this bounds the other entries too
-    diagonal = (a >= 0) & (b >= 0) & (c >= 0)
-    minors = (slack * ab <= a * b) & (slack * ac <= a * c) & (slack * bc <= b * c)
-    return finite & diagonal & minors & (slack * det_gap <= a * b * c)
+    n = len(P)
+    if n > SMALL:
+        lifted = (
+            jnp.triu(P) + jnp.triu(P, 1).T + jnp.diag(jnp.diagonal(P) * _rounding(P.dtype) + jnp.finfo(P.dtype).tiny)
+        )
+        return jnp.all(jnp.diagonal(P) >= 0) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(lifted)))
+    S = Matrix.symmetric(P)
+    lift = 1 + _rounding(P.dtype)
+    rows = [[S[i, j] * lift if i == j else S[i, j] for j in range(n)] for i in range(n)]
+    good: Scalar = True
+    finite: Scalar = 0
+    for j in range(n):
+        pivot = rows[j][j]
+        positive = pivot > 0
+        share = 1 / jnp.where(positive, pivot, 1)
+        rest = [rows[i][j] for i in range(j + 1, n)]
+        empty = functools.reduce(jnp.logical_and, [x == 0 for x in rest], pivot == 0)
+        good = good & (positive | empty)
+        finite = finite + S[j, j]
+        for i in range(j + 1, n):
+            scaled = rows[i][j] * share
+            for k in range(j + 1, i + 1):
+                rows[i][k] = rows[i][k] - scaled * rows[k][j]
+    return good & jnp.isfinite(finite)
+
+
+def _rounding(dtype: Any) -> float:
+    return 64 * float(jnp.finfo(dtype).eps)

@@ -42,12 +42,17 @@ def words_of(key: jax.Array) -> Words:
     return threefry((data[0], data[1]), counter)
 
 
+def lanes(count: int) -> int:
+    """How many lanes the draw of so many numbers takes: two numbers a lane, or one where more than 8 are drawn."""
+    return -(-count // 2) if count <= _FEW else count
+
+
 def uniforms(key: Words, step: jax.Array, lane: Any, count: int, dtype: Any) -> jax.Array:
     """Numbers (count,) evenly spread over (0, 1), neither end included.
 
     Args:
         key: from `words_of`. step: () integer, >= 0. lane: () integer, >= 0, where to begin in what this key and step
-            have to give, so that uses apart take lanes apart: two numbers a lane, or one where more than 8 are drawn.
+            have to give, so that uses apart take lanes apart (`lanes`).
         count: how many. dtype: floating point; multiples of 2**-24 in all of them, so that the same key gives the same
             numbers.
     """
@@ -78,8 +83,8 @@ def _draw(numbers: Callable[[Words], Words], key: Words, step: jax.Array, lane: 
     """Numbers (count,) from a function of two words to two numbers."""
     step, lane = jnp.asarray(step, jnp.uint32), jnp.asarray(lane, jnp.uint32)
     if count <= _FEW:  # one by one, so that each lies in memory beside that of the next run
-        pairs = (numbers(threefry(key, (step, lane + np.uint32(i)))) for i in range(-(-count // 2)))
+        pairs = (numbers(threefry(key, (step, lane + np.uint32(i)))) for i in range(lanes(count)))
         return jnp.stack([number for pair in pairs for number in pair][:count])
     # The second numbers are left alone: to put them behind the first would cost more than to draw again.
-    lanes = lane + jnp.arange(count, dtype=jnp.uint32)
-    return numbers(threefry(key, (jnp.full_like(lanes, step), lanes)))[0]
+    every = lane + jnp.arange(count, dtype=jnp.uint32)
+    return numbers(threefry(key, (jnp.full_like(every, step), every)))[0]

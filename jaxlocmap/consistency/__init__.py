@@ -19,7 +19,6 @@ from jaxlocmap.consistency.means import (
 from jaxlocmap.consistency.report import AXES, PoseMeans, by_component, pose_fields, share_in_band
 from jaxlocmap.consistency.statistics import (
     COVERAGE_LEVELS,
-    POSE_DIMENSION,
     WITHIN_TWO_SIGMA,
     PoseScore,
     chi2_band,
@@ -34,7 +33,6 @@ from jaxlocmap.consistency.verdict import Basis, gate_verdict, readable, verdict
 __all__ = [
     "AXES",
     "COVERAGE_LEVELS",
-    "POSE_DIMENSION",
     "WITHIN_TWO_SIGMA",
     "Basis",
     "Innovations",

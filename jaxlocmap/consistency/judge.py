@@ -16,7 +16,6 @@ from jaxlocmap.consistency.means import Mean, average, run_averages, student_t
 from jaxlocmap.consistency.report import PoseMeans, pose_fields, share_in_band
 from jaxlocmap.consistency.statistics import (
     COVERAGE_LEVELS,
-    POSE_DIMENSION,
     WITHIN_TWO_SIGMA,
     PoseScore,
     chi2_band,
@@ -24,6 +23,7 @@ from jaxlocmap.consistency.statistics import (
     score_pose,
 )
 from jaxlocmap.consistency.verdict import Basis, verdict
+from jaxlocmap.se2 import POSE
 
 _PHASES = 10  # equal parts of a drive
 _SYMMETRIC = 1e-6  # of √(variance · variance): entries of a covariance may differ from their mirror images by so much
@@ -86,7 +86,7 @@ def judge(
     }
     nees = np.where(scored, score.nees, np.nan)
     axis = np.where(scored[..., None], np.stack(score.axis_nees, -1), np.nan)
-    diverged = _diverged(known, scored, np.asarray(score.lost))
+    diverged = _diverged(known, scored, np.asarray(score.diverged))
     means, spans = _means(nees, axis, diverged, stamps)
     runs_judged = int(known.any(1).sum())
     basis = Basis(
@@ -99,7 +99,7 @@ def judge(
         np.where(scored[..., None], np.stack(x, -1), np.nan) for x in (score.error_square, score.variance)
     )
     per_step = _over_runs(nees)
-    band = chi2_band(POSE_DIMENSION, max(basis.runs, 1))
+    band = chi2_band(POSE, max(basis.runs, 1))
     rms = np.sqrt(_over_all(square))
     report = {
         "runs": runs,
@@ -195,15 +195,15 @@ def _means(nees: np.ndarray, axis: np.ndarray, diverged: np.ndarray, time: np.nd
     steps = nees.shape[1]
     edges = np.unique(np.arange(_PHASES + 1) * steps // _PHASES)
     spans = [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
-    whole = average(nees, POSE_DIMENSION)
+    whole = average(nees, POSE)
     # One run is judged as it is; so are many that have all diverged.
     kept = ~diverged if len(nees) > 1 and not diverged.all() else slice(None)
     means = PoseMeans(
         nees=whole,
-        undiverged_nees=average(nees[kept], POSE_DIMENSION),
+        undiverged_nees=average(nees[kept], POSE),
         axis_nees=tuple(average(axis[kept, :, i], 1) for i in range(3)),
         within_two_sigma=tuple(shares(axis[..., i] <= 4, WITHIN_TWO_SIGMA) for i in range(3)),
-        covered=tuple(shares(nees < chi2_quantile(level, POSE_DIMENSION), level) for level in COVERAGE_LEVELS),
+        covered=tuple(shares(nees < chi2_quantile(level, POSE), level) for level in COVERAGE_LEVELS),
         phases=tuple(_phase(nees[kept], span, whole) for span in spans),
         phase_spans=tuple((float(time[span.start]), float(time[span.stop - 1])) for span in spans),
     )
@@ -212,14 +212,14 @@ def _means(nees: np.ndarray, axis: np.ndarray, diverged: np.ndarray, time: np.nd
 
 def _phase(nees: np.ndarray, span: slice, whole: Mean) -> Mean:
     """A part of the drive. That of a single run is too short to tell its own correlation time: it takes the run's."""
-    part = average(nees[:, span], POSE_DIMENSION)
+    part = average(nees[:, span], POSE)
     if len(nees) > 1 or not part.samples:
         return part
     count, all_steps = np.isfinite(nees[0, span]).sum(), np.isfinite(nees).sum()
     samples = max(whole.samples * count / all_steps, 1.0)
-    reach = student_t(samples) * math.sqrt(2 * POSE_DIMENSION / samples)
+    reach = student_t(samples) * math.sqrt(2 * POSE / samples)
     error = float(np.nanstd(nees[0, span])) / math.sqrt(samples)
-    return Mean(part.value, error, samples, (POSE_DIMENSION - reach, POSE_DIMENSION + reach))
+    return Mean(part.value, error, samples, (POSE - reach, POSE + reach))
 
 
 def _dishonest(
@@ -230,7 +230,7 @@ def _dishonest(
     for phase, span in zip(means.phases, spans, strict=True):
         widened = student_t(phase.samples, 1 - 0.05 / len(spans)) / student_t(phase.samples)
         reach = widened * (phase.band_95[1] - phase.band_95[0]) / 2
-        if not abs(phase.value - POSE_DIMENSION) > reach:
+        if not abs(phase.value - POSE) > reach:
             continue
         here = truth[:, span][scored[:, span]]
         found.append(
@@ -238,7 +238,7 @@ def _dishonest(
                 "from_s": float(time[span.start]),
                 "to_s": float(time[span.stop - 1]),
                 "anees": phase.value,
-                "side": "over-confident" if phase.value > POSE_DIMENSION else "under-confident",
+                "side": "over-confident" if phase.value > POSE else "under-confident",
                 "x_m": [float(here[:, 0].min()), float(here[:, 0].max())],
                 "y_m": [float(here[:, 1].min()), float(here[:, 1].max())],
             }

@@ -64,9 +64,10 @@ def share_in_band(nees_per_step: np.ndarray, band: tuple[float, float]) -> dict[
     return {name: mean.value, f"{name}_interval_95": (max(mean.value - reach, 0.0), min(mean.value + reach, 1.0))}
 
 
-def by_component(values: np.ndarray) -> dict[str, float]:
-    """Values (m,) of the components of an innovation, by name: range and bearing, or their numbers."""
-    names = ("range", "bearing") if len(values) == 2 else tuple(map(str, range(len(values))))
+def by_component(values: np.ndarray, names: tuple[str, ...] | None = None) -> dict[str, float]:
+    """Values (m,) of the components of an innovation by name; without names, range and bearing or their numbers."""
+    if names is None:
+        names = ("range", "bearing") if len(values) == 2 else tuple(map(str, range(len(values))))
     return dict(zip(names, np.asarray(values).tolist(), strict=True))
 
 

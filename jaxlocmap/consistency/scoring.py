@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -9,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import consistency
-from jaxlocmap.mapping import grid
+from jaxlocmap.consistency import statistics
+from jaxlocmap.mapping import quality
+from jaxlocmap.se2 import POSE, boxminus
 from jaxlocmap.simulation.world import World, occupancy
-from jaxlocmap.step import Sighting
+from jaxlocmap.step import Observation
 from jaxlocmap.types import Config, Gaussian
 
 PHASES = 4  # equal parts of a drive, each with an average NEES of its own
@@ -37,7 +39,7 @@ class Averages(NamedTuple):
 
     nees: jax.Array  # ()
     within_two_sigma: jax.Array  # (3,) share of steps
-    covered: jax.Array  # (levels,) share of steps inside each ellipsoid of `consistency.COVERAGE_LEVELS`
+    covered: jax.Array  # (levels,) share of steps inside each ellipsoid of `statistics.COVERAGE_LEVELS`
 
 
 class Undiverged(NamedTuple):
@@ -46,6 +48,14 @@ class Undiverged(NamedTuple):
     nees: jax.Array  # () over its scored steps
     axis_nees: jax.Array  # (3,) the same of each axis alone, error² / σ²
     phase_nees: jax.Array  # (PHASES,) over each phase, if every step is scored
+
+
+class StateTotals(NamedTuple):
+    """Of the whole state, where it is more than a pose and the truth of it is known."""
+
+    scored_runs: jax.Array  # () runs with any step scored
+    nees: jax.Array  # () the run's average, over its scored steps
+    nees_square: jax.Array  # () its square
 
 
 class Totals(NamedTuple):
@@ -71,12 +81,13 @@ class Totals(NamedTuple):
     unscored_observations: jax.Array  # () the others: a reading or a belief that is no number
     nis: jax.Array  # (T,)
     accepted: jax.Array  # (T,)
-    lag_one: jax.Array  # (2, 2) the run's correlations at lag one of range and bearing, and their squares
+    lag_one: jax.Array  # (2, m) the run's correlations at lag one of the components of z, and their squares
     lag_runs: jax.Array  # () runs with any pair of observations of one landmark
     lag_pairs: jax.Array  # ()
     flagged_steps: jax.Array  # () steps whose `Info.ok` is False
-    diverged: jax.Array  # () 1 if the run lost the robot at any step, or ended without a finite belief
+    diverged: jax.Array  # () 1 if the run diverged at any step, or ended without a finite belief
     map: MapTotals | None
+    state: StateTotals | None = None
 
 
 class StepTally(NamedTuple):
@@ -89,10 +100,12 @@ class StepTally(NamedTuple):
     covered: jax.Array  # (levels,)
     phase_nees: jax.Array  # (PHASES,)
     flagged: jax.Array  # ()
-    lost: jax.Array  # ()
+    diverged: jax.Array  # ()
+    state_scored: jax.Array | None  # () None where the state is a pose, or no more of it is known
+    state_nees: jax.Array | None  # ()
 
 
-class SightingTally(NamedTuple):
+class ObservationTally(NamedTuple):
     """What a run adds up of its observations; at one step, of that step."""
 
     observed: jax.Array  # ()
@@ -100,16 +113,16 @@ class SightingTally(NamedTuple):
     accepted: jax.Array  # ()
     unscored: jax.Array  # ()
     unusable: jax.Array  # ()
-    lag_products: jax.Array  # (2,)
-    lag_squares: jax.Array  # (2,) mean of both members' squares
+    lag_products: jax.Array  # (m,)
+    lag_squares: jax.Array  # (m,) mean of both members' squares
     lag_pairs: jax.Array  # ()
 
 
 class Latest(NamedTuple):
-    """The last observation of each landmark."""
+    """The last observation of each target."""
 
     seen: jax.Array  # (L,) bool: there was one
-    white: tuple[jax.Array, jax.Array]  # (L,) each: its innovation, whitened
+    white: tuple[jax.Array, ...]  # (L,) for each component: its innovation, whitened
 
 
 class PerStep(NamedTuple):
@@ -129,32 +142,41 @@ def phase_edges(steps: int) -> list[int]:
     return [-(-i * steps // PHASES) for i in range(PHASES + 1)]
 
 
-def no_steps(zero: jax.Array) -> StepTally:
-    """The tally before the first step. zero: () of the dtype to count in."""
-    three, levels = jnp.full(3, zero), jnp.full(len(consistency.COVERAGE_LEVELS), zero)
-    return StepTally(zero, zero, three, three, levels, jnp.full(PHASES, zero), zero, zero)
+def no_steps(dtype: Any, *, whole_state: bool) -> StepTally:
+    """The tally before the first step. whole_state: more than the pose is scored."""
+    zero, three = jnp.zeros((), dtype), jnp.zeros(POSE, dtype)
+    levels, state = jnp.zeros(len(statistics.COVERAGE_LEVELS), dtype), zero if whole_state else None
+    return StepTally(zero, zero, three, three, levels, jnp.zeros(PHASES, dtype), zero, zero, state, state)
 
 
-def no_sightings(zero: jax.Array) -> SightingTally:
-    """The tally before the first observation. zero: () of the dtype to count in."""
-    pair = jnp.full(2, zero)
-    return SightingTally(zero, zero, zero, zero, zero, pair, pair, zero)
+def no_observations(dtype: Any, dim: int) -> ObservationTally:
+    """The tally before the first observation, of a sensor whose observations have `dim` components."""
+    zero, each = jnp.zeros((), dtype), jnp.zeros(dim, dtype)
+    return ObservationTally(zero, zero, zero, zero, zero, each, each, zero)
 
 
 def score_step(
-    belief: Gaussian, truth: jax.Array, ok: jax.Array, phase: jax.Array
+    belief: Gaussian, truth: jax.Array, ok: jax.Array, phase: jax.Array, *, angles: tuple[int, ...]
 ) -> tuple[StepTally, tuple[jax.Array, ...], tuple[jax.Array, ...]]:
     """The tally of one step, and its squared error and variance along x, y, yaw.
 
     Args:
-        belief, truth: after the step.
+        belief: after the step.
+        truth: (n,) the true state after the step, as much of it as there is.
         ok: () bool, as in `Info`.
         phase: () int32, which part of the drive the step belongs to, the same for all runs.
+        angles: entries of the state that are angles, static.
     """
     dtype = truth.dtype
-    score = consistency.score_pose(truth, *belief)
+    score = statistics.score_pose(truth[:POSE], *belief.pose)
     scored, nees = score.scored, score.nees
-    quantiles = [consistency.chi2_quantile(p, consistency.POSE_DIMENSION) for p in consistency.COVERAGE_LEVELS]
+    quantiles = [statistics.chi2_quantile(p, POSE) for p in statistics.COVERAGE_LEVELS]
+    state_scored = state_nees = None
+    if (known := min(len(truth), len(belief.mean))) > POSE:
+        error = boxminus(truth[:known], belief.mean[:known], tuple(i for i in angles if i < known))
+        distance = statistics.nees(error, belief.cov[:known, :known])
+        finite = jnp.isfinite(distance)
+        state_scored, state_nees = finite.astype(dtype), jnp.where(finite, distance, 0)
     tally = StepTally(
         scored=scored.astype(dtype),
         nees=nees,
@@ -163,37 +185,40 @@ def score_step(
         covered=jnp.stack([(scored & (nees < quantile)).astype(dtype) for quantile in quantiles]),
         phase_nees=jnp.stack([nees * (phase == i).astype(dtype) for i in range(PHASES)]),
         flagged=(~ok).astype(dtype),
-        lost=score.lost.astype(dtype),
+        diverged=score.diverged.astype(dtype),
+        state_scored=state_scored,
+        state_nees=state_nees,
     )
     return tally, score.error_square, score.variance
 
 
-def score_sighting(
-    sighting: Sighting, valid: jax.Array, used: jax.Array, latest: Latest
-) -> tuple[SightingTally, Latest]:
-    """The tally of one observation of one landmark, and what the next one is to be compared with."""
-    dtype = sighting.nis.dtype
-    white = consistency.whiten(sighting.innovation, sighting.S)
+def score_observation(
+    observation: Observation, valid: jax.Array, used: jax.Array, latest: Latest
+) -> tuple[ObservationTally, Latest]:
+    """The tally of one observation of one target, and what the next one is to be compared with."""
+    dtype, m = observation.nis.dtype, len(observation.innovation)
+    white = statistics.whiten(observation.innovation, observation.S)
     # What the filter could not use has S zero; where the belief has broken down, nothing whitens to a number.
-    measured = (sighting.S[0, 0] > 0) & jnp.isfinite(white[0] ** 2 + white[1] ** 2)
+    measured = (observation.S[0, 0] > 0) & jnp.isfinite(functools.reduce(jnp.add, [white[i] ** 2 for i in range(m)]))
     paired = measured & latest.seen
-    tally = SightingTally(
+    pairs = [(white[i], latest.white[i]) for i in range(m)]
+    tally = ObservationTally(
         observed=measured.astype(dtype),
-        nis=jnp.where(measured, sighting.nis, 0),
-        accepted=sighting.accepted.astype(dtype),
+        nis=jnp.where(measured, observation.nis, 0),
+        accepted=observation.accepted.astype(dtype),
         unscored=(valid & ~measured).astype(dtype),
         unusable=(valid & ~used).astype(dtype),
-        lag_products=jnp.stack([jnp.where(paired, white[i] * latest.white[i], 0) for i in range(2)]),
-        lag_squares=jnp.stack([jnp.where(paired, (white[i] ** 2 + latest.white[i] ** 2) / 2, 0) for i in range(2)]),
+        lag_products=jnp.stack([jnp.where(paired, now * before, 0) for now, before in pairs]),
+        lag_squares=jnp.stack([jnp.where(paired, (now**2 + before**2) / 2, 0) for now, before in pairs]),
         lag_pairs=paired.astype(dtype),
     )
-    first, second = (jnp.where(measured, white[i], latest.white[i]) for i in range(2))
-    return tally, Latest(latest.seen | measured, (first, second))
+    kept = tuple(jnp.where(measured, now, before) for now, before in pairs)
+    return tally, Latest(latest.seen | measured, kept)
 
 
 def run_totals(
     steps: StepTally,
-    sightings: SightingTally,
+    observations: ObservationTally,
     truth: jax.Array,
     belief: Gaussian,
     of_map: MapTotals | None,
@@ -203,11 +228,12 @@ def run_totals(
 ) -> dict[str, Any]:
     """What one run of `length` steps adds to a study: the fields of `Totals` that are not `PerStep`, by name."""
     dtype = steps.nees.dtype
-    some, seen = jnp.maximum(steps.scored, 1), jnp.maximum(sightings.observed, 1)
+    some, seen = jnp.maximum(steps.scored, 1), jnp.maximum(observations.observed, 1)
     average = Averages(*(x / some for x in (steps.nees, steps.within_two_sigma, steps.covered)))
-    run_nis = sightings.nis / seen
-    ended = jnp.all(jnp.isfinite(truth - belief.mean)) & jnp.all(jnp.isfinite(jnp.diagonal(belief.cov)))
-    diverged = (steps.lost > 0) | ~ended
+    run_nis = observations.nis / seen
+    ended = jnp.all(jnp.isfinite(truth)) & jnp.all(jnp.isfinite(belief.mean))
+    ended = ended & jnp.all(jnp.isfinite(jnp.diagonal(belief.cov)))
+    diverged = (steps.diverged > 0) | ~ended
     scored = steps.scored > 0
     kept = scored & ~diverged
     whole = kept & (steps.scored == length)
@@ -220,9 +246,9 @@ def run_totals(
     # Each run is counted at its lowest edge that lies above; differences make bins of these.
     below = jnp.concatenate([average.nees < jnp.asarray(NEES_EDGES, dtype), jnp.full(1, scored)]) & scored
     bins = below.astype(dtype) - jnp.concatenate([jnp.zeros(1, dtype), below[:-1].astype(dtype)])
-    paired, squares = sightings.lag_pairs > 0, sightings.lag_squares
+    paired, squares = observations.lag_pairs > 0, observations.lag_squares
     # Zero where nothing is paired, or where all innovations are exactly zero.
-    lag_one = sightings.lag_products / jnp.where(squares > 0, squares, 1)
+    lag_one = observations.lag_products / jnp.where(squares > 0, squares, 1)
     return dict(
         runs=jnp.ones((), dtype),
         exact_starts=jnp.full((), exact_start, dtype),
@@ -235,15 +261,23 @@ def run_totals(
         undiverged_square=jax.tree.map(jnp.square, undiverged),
         nees_bins=bins,
         run_nis=jnp.stack([run_nis, run_nis**2]),
-        observing_runs=(sightings.observed > 0).astype(dtype),
-        unscored_observations=sightings.unscored,
+        observing_runs=(observations.observed > 0).astype(dtype),
+        unscored_observations=observations.unscored,
         lag_one=jnp.stack([lag_one, lag_one**2]),
         lag_runs=paired.astype(dtype),
-        lag_pairs=sightings.lag_pairs,
+        lag_pairs=observations.lag_pairs,
         flagged_steps=steps.flagged,
         diverged=diverged.astype(dtype),
         map=of_map,
+        state=_state_totals(steps),
     )
+
+
+def _state_totals(steps: StepTally) -> StateTotals | None:
+    if steps.state_scored is None or steps.state_nees is None:
+        return None
+    average = steps.state_nees / jnp.maximum(steps.state_scored, 1)
+    return StateTotals((steps.state_scored > 0).astype(average.dtype), average, average**2)
 
 
 def map_totals(log_odds: jax.Array | None, world: World, config: Config) -> MapTotals | None:
@@ -251,7 +285,7 @@ def map_totals(log_odds: jax.Array | None, world: World, config: Config) -> MapT
     if log_odds is None or config.grid is None:
         return None
     occupied, seen = occupancy(world, config.grid), log_odds != 0
-    sums = grid.score(log_odds, occupied, seen)
+    sums = quality.score(log_odds, occupied, seen)
     return MapTotals(
         entropy_bits=sums.entropy_bits,
         brier=sums.square / jnp.maximum(jnp.sum(sums.cells), 1),

@@ -5,24 +5,24 @@ They work inside the loop and inside `vmap`. A pose error is truth minus estimat
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import Matrix, forward, ldl
+from jaxlocmap._internal.linalg import SMALL, Matrix, forward, ldl
 from jaxlocmap.filters.ekf import gate_threshold
-from jaxlocmap.motion import wrap
+from jaxlocmap.se2 import POSE, boxminus
 
-POSE_DIMENSION = 3
 COVERAGE_LEVELS = (0.50, 0.90, 0.95, 0.99)
 WITHIN_TWO_SIGMA = math.erf(math.sqrt(2))  # of the values of a normal variable
-# The robot is lost where a pose is further off than this, and the filter all but excludes that itself. The second half
-# spares a filter that has seen nothing for long and says so.
-_LOST_DISTANCE = 1.0  # m
-_LOST_TAIL = 1e-6  # of honest poses have such a NEES
+# A filter has diverged where a pose is further off than this, and the filter all but excludes that itself. The second
+# half spares a filter that has seen nothing for long and says so.
+_DIVERGED_DISTANCE = 1.0  # m
+_DIVERGED_TAIL = 1e-6  # of honest poses have such a NEES
 
 
 def pose_error(truth: jax.Array, estimate: jax.Array) -> jax.Array:
@@ -35,18 +35,17 @@ def pose_error(truth: jax.Array, estimate: jax.Array) -> jax.Array:
     Raises:
         ValueError: a wrong shape; a batch is a `vmap`.
     """
-    checks.shape("truth", truth, (3,))
-    checks.shape("estimate", estimate, (3,))
-    error = truth - estimate
-    return jnp.stack([error[0], error[1], wrap(error[2])])
+    checks.shape("truth", truth, (POSE,))
+    checks.shape("estimate", estimate, (POSE,))
+    return boxminus(truth, estimate)
 
 
 def nees(error: jax.Array, cov: jax.Array) -> jax.Array:
-    """Normalised estimation error squared, eᵀ P⁻¹ e: χ² with 3 degrees if the covariance is honest.
+    """Normalised estimation error squared, eᵀ P⁻¹ e: χ² with n degrees if the covariance is honest.
 
     Args:
-        error: (3,) m, m, rad, from `pose_error`.
-        cov: (3, 3) the estimate's covariance, of which the upper triangle is read.
+        error: (n,), of a pose (3,) m, m, rad from `pose_error`.
+        cov: (n, n) the estimate's covariance, of which the upper triangle is read.
 
     Returns:
         () >= 0; NaN where the covariance is not positive definite.
@@ -55,11 +54,16 @@ def nees(error: jax.Array, cov: jax.Array) -> jax.Array:
     Raises:
         ValueError: a wrong shape; a batch is a `vmap`.
     """
-    checks.shape("error", error, (3,))
-    checks.shape("cov", cov, (3, 3))
+    checks.shape("error", error, (None,))
+    n = len(error)
+    checks.shape("cov", cov, (n, n))
+    if n > SMALL:
+        L = jnp.linalg.cholesky(jnp.triu(cov) + jnp.triu(cov, 1).T)
+        white = jax.scipy.linalg.solve_triangular(L, error, lower=True)
+        return jnp.sum(white * white)
     L, D = ldl(Matrix.symmetric(cov))
-    definite = (D[0] > 0) & (D[1] > 0) & (D[2] > 0)
-    distance = sum(y * y / d for y, d in zip(forward(L, tuple(error)), D, strict=True))
+    definite = functools.reduce(jnp.logical_and, [d > 0 for d in D])
+    distance: Any = sum(y * y / d for y, d in zip(forward(L, tuple(error)), D, strict=True))
     return jnp.where(definite, distance, jnp.nan)
 
 
@@ -71,7 +75,7 @@ class PoseScore(NamedTuple):
     error_square: tuple[jax.Array, ...]  # x, y, yaw: () each, m², m², rad²
     variance: tuple[jax.Array, ...]  # the same of the filter's own
     axis_nees: tuple[jax.Array, ...]  # of each axis alone, error² / σ²
-    lost: jax.Array  # () bool: over a metre off, and the covariance all but excludes it
+    diverged: jax.Array  # () bool: over a metre off, and the covariance all but excludes it
 
 
 def score_pose(truth: jax.Array, mean: jax.Array, cov: jax.Array) -> PoseScore:
@@ -91,9 +95,9 @@ def score_pose(truth: jax.Array, mean: jax.Array, cov: jax.Array) -> PoseScore:
     square = [jnp.where(scored, error[i] ** 2, 0) for i in range(3)]
     variance = [jnp.where(scored, cov[i, i], 0) for i in range(3)]
     ratio = [jnp.where(scored, square[i] / cov[i, i], 0) for i in range(3)]
-    surprising = distance > chi2_quantile(1 - _LOST_TAIL, POSE_DIMENSION)
-    lost = scored & (square[0] + square[1] > _LOST_DISTANCE**2) & surprising
-    return PoseScore(scored, jnp.where(scored, distance, 0), tuple(square), tuple(variance), tuple(ratio), lost)
+    surprising = distance > chi2_quantile(1 - _DIVERGED_TAIL, POSE)
+    diverged = scored & (square[0] + square[1] > _DIVERGED_DISTANCE**2) & surprising
+    return PoseScore(scored, jnp.where(scored, distance, 0), tuple(square), tuple(variance), tuple(ratio), diverged)
 
 
 def whiten(innovation: jax.Array, S: jax.Array) -> jax.Array:

@@ -17,29 +17,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import consistency, simulation
-from jaxlocmap._internal.batching import cond, scan, sum_over_runs, zero_like_any
+from jaxlocmap import checks, consistency, motion, sensors, simulation
+from jaxlocmap._internal.batching import cond, scan, sum_over_runs
 from jaxlocmap._internal.random import words_of
 from jaxlocmap.consistency.scoring import (
     NEES_EDGES,
     PHASES,
     Latest,
     MapTotals,
+    ObservationTally,
     PerStep,
-    SightingTally,
     Totals,
     map_totals,
-    no_sightings,
+    no_observations,
     no_steps,
     phase_edges,
     run_totals,
-    score_sighting,
+    score_observation,
     score_step,
 )
-from jaxlocmap.mapping import grid
 from jaxlocmap.pipeline import init
+from jaxlocmap.se2 import POSE
 from jaxlocmap.simulation.world import World
-from jaxlocmap.step import correct, map_scan, predict, sound
+from jaxlocmap.step import Observed, clamp_map, correct, turn
 from jaxlocmap.types import Config, Gaussian, Params, State
 
 __all__ = ["MapTotals", "Study", "Totals", "reference_study", "summarise"]
@@ -50,8 +50,8 @@ class Study:
     """One run of a consistency study: simulate, filter and score, all in one loop. Hashable, so `monte_carlo` compiles
     it once.
 
-    Its loop is that of `pipeline.run` over a drive of `simulate.simulate`, step by step; it keeps neither the
-    measurements nor the beliefs, which would have to travel to memory and back.
+    Its loop turns as `pipeline.run` does over a drive of `simulation.simulate`; it keeps neither the measurements nor
+    the beliefs, which would have to travel to memory and back.
     """
 
     scenario: simulation.Scenario
@@ -64,90 +64,105 @@ class Study:
         world: World,
         noise: simulation.Noise,
         prior: Gaussian,
-        gate_probability: jax.Array | None = None,
         *,
         add_up: Callable[[Any], Any] = lambda own: own,
     ) -> Totals:
         """Totals of the run that `key` stands for.
 
         Args:
-            key: of this run. params: the filter's. world, noise, prior: as their fields say.
-            gate_probability: takes the place of the configuration's; a value, so that a sweep over gates compiles once.
+            key: of this run.
+            params: the filter's.
+            world, noise: as their fields say.
+            prior: (n,), (n, n) of the longer of the true state and the filter's; each begins with its first entries.
             add_up: what becomes of everything that is to be added up over runs, each step's as soon as it is there.
+
+        Raises:
+            ValueError: a configuration that is not of the scenario's robot, or a wrong shape.
         """
         params.check()
-        if self.config.sensor_offset != self.scenario.sensor_offset:
-            raise ValueError(
-                f"config.sensor_offset: expected that of the scenario, {self.scenario.sensor_offset}, "
-                f"got {self.config.sensor_offset}"
-            )
+        self.scenario.check(self.config)
         dtype = prior.mean.dtype
         params, world, noise = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, world, noise))
         config, scenario = self.config, self.scenario
-        if gate_probability is not None:
-            config = dataclasses.replace(config, gate_probability=gate_probability)
-        zero = zero_like_any(key, params, world, noise, prior, gate_probability).astype(dtype)
+        model, sensor = motion.resolve(config.motion), sensors.resolve(config.sensor)
+        checks.shape("prior.mean", prior.mean, (max(model.dim, scenario.dim),))
         start_key, key = jax.random.split(key)
-        start = prior.mean if scenario.exact_prior else simulation.draw_pose(start_key, prior)
-        words = words_of(key)
-        landmarks = jnp.arange(len(world.landmarks), dtype=jnp.int32)
+        truth = (prior.mean if scenario.exact_prior else simulation.draw_state(start_key, prior))[: scenario.dim]
+        words, targets = words_of(key), simulation.targets(world, scenario=scenario)
+        number = jnp.arange(len(targets), dtype=jnp.int32)
         beam_angles = scenario.beam_angles().astype(dtype)
 
-        def sight(pose: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
-            """Look for one landmark after the other, and correct by it."""
+        def detect(truth: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
+            """Detect one target after the other, and correct by it."""
 
-            def one(carry: tuple[Gaussian, SightingTally], now: tuple[Any, ...]) -> tuple[Any, Latest]:
+            def one(carry: tuple[Gaussian, ObservationTally], now: tuple[Any, ...]) -> tuple[Any, Latest]:
                 belief, tally = carry
                 j, x, y, latest = now
-                draws = simulation.draw_sighting(words, k, j, scenario=scenario, dtype=dtype)
-                landmark = jnp.stack([x, y])
-                z, valid = simulation.sight(draws, pose, landmark, noise, scenario=scenario)
-                belief, sighting, used = correct(params, belief, z, landmark, j, valid, config=config)
-                one_more, latest = score_sighting(sighting, valid, used, latest)
+                draws = simulation.draw_detection(words, k, j, scenario=scenario, dtype=dtype)
+                target = jnp.stack([x, y])
+                z, valid = simulation.detect(draws, truth, target, world, noise, scenario=scenario)
+                belief, observation, used = correct(params, belief, z, target, j, valid, config=config)
+                one_more, latest = score_observation(observation, valid, used, latest)
                 return (belief, jax.tree.map(jnp.add, tally, one_more)), latest
 
-            places = landmarks, world.landmarks[:, 0], world.landmarks[:, 1]
-            (belief, tally), latest = scan(one, (belief, no_sightings(zero)), (*places, latest))
+            begin = belief, no_observations(dtype, sensor.dim)
+            (belief, tally), latest = scan(one, begin, (number, targets[:, 0], targets[:, 1], latest))
             return belief, tally, latest
 
-        def look_away(pose: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
-            del pose, k
-            return belief, no_sightings(zero), latest
+        def rest(truth: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
+            del truth, k
+            return belief, no_observations(dtype, sensor.dim), latest
 
-        def turn(carry: tuple[Any, ...], k: jax.Array) -> tuple[tuple[Any, ...], PerStep]:
-            pose, belief, log_odds, latest, steps, sightings = carry
-            pose, control = simulation.drive(simulation.draw_drive(words, k, dtype), k, pose, noise, scenario=scenario)
-            belief, moved = predict(params, belief, control, jnp.asarray(scenario.dt, dtype), config=config)
-            belief, seen, latest = cond(scenario.looks(k), sight, look_away, pose, k, belief, latest)
-            if log_odds is not None:
+        def one_step(carry: tuple[Any, ...], k: jax.Array) -> tuple[tuple[Any, ...], PerStep]:
+            truth, state, latest, steps, observations = carry
+            draws = simulation.draw_drive(words, k, scenario=scenario, dtype=dtype)
+            truth, control = simulation.drive(draws, k, truth, noise, scenario=scenario)
+
+            def observe(belief: Gaussian) -> Observed:
+                belief, *seen = cond(scenario.detector.active(k), detect, rest, truth, k, belief, latest)
+                return Observed(belief, seen, jnp.zeros((), dtype), seen[0].unusable == 0)
+
+            ranges = None
+            if config.grid is not None:
                 draws = simulation.draw_scan(words, k, scenario=scenario, dtype=dtype)
-                ranges = simulation.look_round(draws, pose, world, noise, scenario=scenario)
-                log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
-            ok = moved & (seen.unusable == 0) & sound(belief)
+                ranges = simulation.simulate_scan(draws, truth, world, noise, scenario=scenario)
+            state, (seen, latest), ok = turn(
+                params,
+                state,
+                control,
+                jnp.asarray(scenario.dt, dtype),
+                observe=observe,
+                ranges=ranges,
+                beam_angles=beam_angles,
+                config=config,
+            )
             phase = PHASES * k // scenario.steps
-            stepped, error_square, variance = score_step(belief, pose, ok, phase)
+            stepped, error_square, variance = score_step(state.belief, truth, ok, phase, angles=model.angles)
             at_step = PerStep(
                 stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted
             )
-            steps, sightings = jax.tree.map(jnp.add, (steps, sightings), (stepped, seen))
-            return (pose, belief, log_odds, latest, steps, sightings), add_up(at_step)
+            steps, observations = jax.tree.map(jnp.add, (steps, observations), (stepped, seen))
+            return (truth, state, latest, steps, observations), add_up(at_step)
 
-        state = jax.tree.map(lambda x: x + zero, init(prior, config=config))
-        none = jnp.full(landmarks.shape, zero)
+        none = jnp.zeros(len(targets), dtype)
         begin = (
-            start + zero_like_any(key, world, noise, prior).astype(dtype),  # whatever the filter believes
-            state.belief,
-            state.log_odds,
-            Latest(none != 0, (none, none)),
-            no_steps(zero),
-            no_sightings(zero),
+            truth,
+            init(prior.first(model.dim), config=config),
+            Latest(none != 0, (none,) * sensor.dim),
+            no_steps(dtype, whole_state=min(model.dim, scenario.dim) > POSE),
+            no_observations(dtype, sensor.dim),
         )
-        (pose, belief, log_odds, _, steps, sightings), per_step = scan(turn, begin, jnp.arange(scenario.steps))
-        if log_odds is not None and config.grid is not None:
-            log_odds = grid.clamp(log_odds, config.grid)
-        of_map = map_totals(log_odds, world, config)
+        (truth, state, _, steps, observations), per_step = scan(one_step, begin, jnp.arange(scenario.steps))
+        state = clamp_map(state, config=config)
+        of_map = map_totals(state.log_odds, world, config)
         of_run = run_totals(
-            steps, sightings, pose, belief, of_map, length=scenario.steps, exact_start=scenario.exact_prior
+            steps,
+            observations,
+            truth,
+            state.belief,
+            of_map,
+            length=scenario.steps,
+            exact_start=scenario.exact_prior,
         )
         return Totals(**per_step._asdict(), **add_up(of_run))
 
@@ -169,7 +184,7 @@ class Study:
             key, params, world, noise, prior: as of a call.
         """
         del key, params, world, noise
-        return init(prior, config=self.config)
+        return init(prior.first(motion.resolve(self.config.motion).dim), config=self.config)
 
 
 def _mean_over_runs(
@@ -190,10 +205,8 @@ def pose_means(totals: Any, config: Config) -> consistency.PoseMeans:
     steps = len(totals.nees)
     edges = phase_edges(steps)
     return consistency.PoseMeans(
-        nees=_mean_over_runs(sums.nees, squares.nees, runs, consistency.POSE_DIMENSION),
-        undiverged_nees=_mean_over_runs(
-            kept.nees, kept_squares.nees, totals.undiverged_runs, consistency.POSE_DIMENSION
-        ),
+        nees=_mean_over_runs(sums.nees, squares.nees, runs, POSE),
+        undiverged_nees=_mean_over_runs(kept.nees, kept_squares.nees, totals.undiverged_runs, POSE),
         axis_nees=tuple(
             _mean_over_runs(kept.axis_nees[i], kept_squares.axis_nees[i], totals.undiverged_runs, 1) for i in three
         ),
@@ -202,9 +215,7 @@ def pose_means(totals: Any, config: Config) -> consistency.PoseMeans:
         ),
         covered=tuple(shares(sums.covered[i], squares.covered[i], level) for i, level in enumerate(levels)),
         phases=tuple(
-            _mean_over_runs(
-                kept.phase_nees[i], kept_squares.phase_nees[i], totals.whole_runs, consistency.POSE_DIMENSION
-            )
+            _mean_over_runs(kept.phase_nees[i], kept_squares.phase_nees[i], totals.whole_runs, POSE)
             for i in range(PHASES)
         ),
         phase_spans=tuple((config.dt * (a + 1), config.dt * b) for a, b in itertools.pairwise(edges)),
@@ -247,9 +258,10 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
     all_scored = float(totals.scored.sum())
     observations = round(float(totals.observed.sum()))
     means = pose_means(totals, config)
-    nis = _mean_over_runs(totals.run_nis[0], totals.run_nis[1], totals.observing_runs, 2)
+    sensor = sensors.resolve(config.sensor)
+    nis = _mean_over_runs(totals.run_nis[0], totals.run_nis[1], totals.observing_runs, sensor.dim)
     per_step = totals.nees / scored
-    band = consistency.chi2_band(consistency.POSE_DIMENSION, runs)
+    band = consistency.chi2_band(POSE, runs)
     error_square, variance = np.stack(totals.error_square, -1), np.stack(totals.variance, -1)
     rms = np.sqrt(error_square.sum(0) / max(all_scored, 1))
     rate = float(totals.accepted.sum()) / observations if observations else math.nan
@@ -288,7 +300,7 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
             float(total / count) if count else None for total, count in zip(totals.nis, totals.observed, strict=True)
         ],
         "nis_chi2_band_95": [
-            consistency.chi2_band(2, round(float(count))) if count else None for count in totals.observed
+            consistency.chi2_band(sensor.dim, round(float(count))) if count else None for count in totals.observed
         ],
         "rmse_per_step": np.sqrt(error_square / scored[:, None]).tolist(),
         "sigma_per_step": np.sqrt(variance / scored[:, None]).tolist(),
@@ -299,17 +311,24 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
         "gate_accept_rate": rate,
         "gate_nominal_rate": config.gate_probability,
         "gate_verdict": consistency.gate_verdict(rate, config.gate_probability, observations),
-        "innovation_lag_one": consistency.by_component(lag),
-        "innovation_lag_one_band_95": consistency.by_component(lag_reach),
+        "innovation_lag_one": consistency.by_component(lag, sensor.noise.components),
+        "innovation_lag_one_band_95": consistency.by_component(lag_reach, sensor.noise.components),
         "diverged_runs": diverged,
         "unscored_observations": round(float(totals.unscored_observations)),
         "unscored_steps": round(runs * steps - all_scored),
         "flagged_steps": round(float(totals.flagged_steps)),
         "verdict": consistency.verdict(means, basis),
     }
+    if totals.state is not None:
+        report |= _state_fields(totals.state, motion.resolve(config.motion).dim)
     if totals.map is not None:
         report["map"] = _map_fields(totals.map, runs)
     return report
+
+
+def _state_fields(totals: Any, dim: int) -> dict[str, Any]:
+    nees = _mean_over_runs(totals.nees, totals.nees_square, totals.scored_runs, dim)
+    return {"state_dimension": dim, "state_anees": nees.value, "state_anees_band_95": nees.band_95}
 
 
 def _map_fields(totals: MapTotals, runs: int) -> dict[str, Any]:
@@ -335,5 +354,5 @@ def reference_study(scenario: simulation.Scenario, config: Config, noise: simula
 
     Its ANEES is what this start and this gate make of an honest covariance. It maps nothing.
     """
-    told = dataclasses.replace(config, motion="euler", grid=None)
-    return Study(scenario, told), simulation.own_params(noise, scenario.dt)
+    told = dataclasses.replace(config, motion=simulation.own_motion(scenario), grid=None)
+    return Study(scenario, told), simulation.own_params(noise, scenario)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from jaxlocmap.consistency.means import Mean, binomial_interval, ratio, student_t
 from jaxlocmap.consistency.report import AXES, PoseMeans
-from jaxlocmap.consistency.statistics import POSE_DIMENSION
+from jaxlocmap.se2 import POSE
 
 _TOLERANCE = 0.01  # a misfit that is there, and that no one need mind
 _LITTLE = 1.25  # up to such a factor an exact start or a gate may be what moves the ANEES,
@@ -55,8 +55,8 @@ def verdict(means: PoseMeans, basis: Basis) -> str:
         return f"no verdict: {basis.steps} scored steps, at least {_FEW_STEPS} of one run expected"
     judged = means.undiverged_nees
     reference = None if basis.reference is None else basis.reference.undiverged_nees
-    relative = _relative(judged, reference, POSE_DIMENSION)
-    expected = POSE_DIMENSION if reference is None else reference.value
+    relative = _relative(judged, reference, POSE)
+    expected = POSE if reference is None else reference.value
     low, high = (expected * limit for limit in relative.band_95)
     others = " of the others" if basis.diverged else ""
     stated = f"ANEES {readable(judged.value, 4)}{others}"
@@ -209,7 +209,7 @@ def _in_words(axes: dict[str, Mean], basis: Basis) -> str:
 def _when(means: PoseMeans, basis: Basis) -> str:
     """Which part of the drive is worst, if one stands out."""
     reference = basis.reference.phases if basis.reference is not None else (None,) * len(means.phases)
-    phases = [_relative(*pair, POSE_DIMENSION) for pair in zip(means.phases, reference, strict=True)]
+    phases = [_relative(*pair, POSE) for pair in zip(means.phases, reference, strict=True)]
     known = [i for i, phase in enumerate(phases) if math.isfinite(phase.value) and phase.value > 0]
     if len(known) < 2:
         return ""

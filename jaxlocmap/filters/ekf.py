@@ -1,11 +1,11 @@
-"""Extended Kalman filter of a pose: predict, update, gate. Bare arrays in, bare arrays out; no loop.
+"""Extended Kalman filter of a state that begins with a pose: predict, update, gate. Bare arrays in, bare arrays out; no
+loop.
 
-Throughout, a pose error is truth minus estimate with the heading wrapped, and Jacobians are taken at the estimate.
+Throughout, an error is truth minus estimate with angles wrapped, and Jacobians are taken at the estimate.
 """
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import Any, NamedTuple
 
@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import scipy.special
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import Matrix, forward, ldl, sandwich, solve, stack, values
-from jaxlocmap.motion import MotionModel, wrap
+from jaxlocmap._internal.linalg import SMALL, Matrix, quadratic_form, stack_scalars
+from jaxlocmap.filters import joseph
+from jaxlocmap.motion import MotionModel
+from jaxlocmap.se2 import HEADING, wrap
 
 _LEAST_WEIGHT = 1e-6  # of an observation at a soft gate: an R of a million times its size says nothing any more
 
@@ -23,8 +25,8 @@ _LEAST_WEIGHT = 1e-6  # of an observation at a soft gate: an R of a million time
 class Update(NamedTuple):
     """What a correction made of one observation of dimension m."""
 
-    mean: jax.Array  # (3,) m, m, rad; unchanged where not accepted, unless the gate is soft
-    cov: jax.Array  # (3, 3); likewise
+    mean: jax.Array  # (n,); unchanged where not accepted, unless the gate is soft
+    cov: jax.Array  # (n, n); likewise
     innovation: jax.Array  # (m,)
     S: jax.Array  # (m, m) covariance of the innovation
     nis: jax.Array  # () squared Mahalanobis distance of the innovation; NaN where S is not positive definite
@@ -36,21 +38,37 @@ def gate_threshold(probability: float | jax.Array | None, dimension: int) -> Any
     """Quantile of χ² with `dimension` degrees: a good observation's distance stays below it with `probability`.
 
     Args:
-        probability: inside (0, 1), or None for no gate. With two degrees it may also be an array, up to 1 for no gate:
-            -2 log(1 - p).
+        probability: inside (0, 1), or None for no gate. An array, also a traced one, may be 1 for no gate.
+        dimension: degrees of freedom.
+
+    Returns:
+        A float, or an array where `probability` is one.
 
     Raises:
-        ValueError: a number outside (0, 1), or an array with other than two degrees.
+        ValueError: a number outside (0, 1).
     """
     if probability is None:
         return float("inf")
     if isinstance(probability, jax.Array):
-        if dimension != 2:
-            raise ValueError(f"gate probability: expected a number for {dimension} degrees, got an array")
-        return -2 * jnp.log1p(-probability)
+        return jnp.where(probability < 1, _chi2_quantile(probability, dimension), jnp.inf)
     if not 0 < probability < 1:
         raise ValueError(f"gate probability: expected a value inside (0, 1), got {probability}")
     return float(2 * scipy.special.gammaincinv(dimension / 2, probability))
+
+
+def _chi2_quantile(probability: jax.Array, dimension: int) -> jax.Array:
+    """As `chi2.ppf`, which `jax.scipy` lacks."""
+    if dimension == 2:
+        return -2 * jnp.log1p(-probability)
+    if dimension == 1:
+        return 2 * jax.scipy.special.erfinv(probability) ** 2
+    p = jnp.clip(probability, 1e-12, 1 - jnp.finfo(probability.dtype).epsneg)
+    half, spread = dimension / 2, 2 / (9 * dimension)
+    x = dimension * (1 - spread + jax.scipy.special.ndtri(p) * math.sqrt(spread)) ** 3  # Wilson & Hilferty 1931
+    for _ in range(4):  # Newton's steps, in the logarithm so that none leaves x > 0
+        density = jnp.exp((half - 1) * jnp.log(x / 2) - x / 2 - math.lgamma(half)) / 2
+        x = x * jnp.exp(-(jax.scipy.special.gammainc(half, x / 2) - p) / (density * x))
+    return x
 
 
 def predict(
@@ -58,34 +76,44 @@ def predict(
     cov: jax.Array,
     control: jax.Array,
     dt: jax.Array,
-    Q: jax.Array,
+    Q: jax.Array | Matrix,
     *,
     motion: MotionModel,
     nominal_dt: float,
 ) -> tuple[jax.Array, jax.Array]:
     """Move the belief by a control.
 
-        x ← f(x, u, dt),   P ← F P Fᵀ + G Q Gᵀ · nominal_dt / dt
+        x ← f(x, u, dt),   P ← F P Fᵀ + G Q Gᵀ · nominal_dt / dt,   u the control, then zeros
 
     The ratio makes Q the noise of one nominal period whatever the step length: two half steps add as much as one
     whole. At dt = 0, where G is zero, nothing is added.
 
     Args:
-        mean: (3,) m, m, rad. cov: (3, 3). control: (2,) m/s, rad/s. dt: () s, >= 0.
-        Q: (2, 2) covariance of the control over `nominal_dt` seconds.
+        mean: (n,) state, beginning with the pose in m, m, rad.
+        cov: (n, n).
+        control: (c,), v m/s and omega rad/s for a differential drive; as long as u (q,) or shorter.
+        dt: () s, >= 0.
+        Q: (q, q) covariance of u over `nominal_dt` seconds.
+        motion: static.
+        nominal_dt: s, static.
 
     Returns:
-        mean (3,), cov (3, 3), symmetric. Source: Thrun, Burgard & Fox 2005, section 7.4.
+        mean (n,), cov (n, n), symmetric. Source: Thrun, Burgard & Fox 2005, section 7.4.
 
     Raises:
         ValueError: a wrong shape, also of what the motion model returns.
     """
-    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)), control=(control, (2,)), dt=(dt, ()), Q=(Q, (2, 2)))
-    moved, (F, G) = motion.transition(mean, control, dt), motion.jacobians(mean, control, dt)
-    checks.shapes(transition=(moved, (3,)), F=(F, (3, 3)), G=(G, (3, 2)))
-    F, G = Matrix.of(F), Matrix.of(G)
+    n, q = motion.dim, motion.inputs
+    checks.shapes(mean=(mean, (n,)), cov=(cov, (n, n)), dt=(dt, ()), Q=(Q, (q, q)))
+    u = motion.full_input(control)
+    moved, (F, G) = motion.transition(mean, u, dt), motion.jacobians(mean, u, dt)
+    checks.shapes(transition=(moved, (n,)), F=(F, (n, n)), G=(G, (n, q)))
     ratio = jnp.where(dt > 0, nominal_dt / jnp.where(dt > 0, dt, 1), 0)
-    P = sandwich(F, Matrix.symmetric(cov)) + sandwich(G, Matrix.symmetric(Q).scale(ratio))
+    if n > SMALL:
+        F, G, Q = (x.array(cov.dtype) if isinstance(x, Matrix) else jnp.asarray(x) for x in (F, G, Q))
+        return moved, _symmetric(F @ cov @ F.T + G @ Q @ G.T * ratio)
+    F, G, Q = Matrix.of(F), Matrix.of(G), Matrix.symmetric(Q)
+    P = quadratic_form(F, Matrix.symmetric(cov)) + quadratic_form(G, Q.scale(ratio))
     return moved, P.array(cov.dtype)
 
 
@@ -94,11 +122,12 @@ def update(
     cov: jax.Array,
     residual: jax.Array,
     H: Matrix | jax.Array,
-    R: jax.Array,
+    R: jax.Array | Matrix,
     *,
     threshold: float | jax.Array = float("inf"),
-    softness: float = 0.0,
+    temperature: float = 0.0,
     valid: jax.Array | bool = True,
+    angles: tuple[int, ...] = HEADING,
 ) -> Update:
     """Correct the belief by one observation of any sensor, in Joseph form, if it passes the gate.
 
@@ -106,14 +135,17 @@ def update(
         if d² < threshold:  x ← x + K r,  P ← (I − K H) P (I − K H)ᵀ + K R Kᵀ
 
     Args:
-        mean: (3,) m, m, rad. cov: (3, 3).
+        mean: (n,) state, beginning with the pose in m, m, rad.
+        cov: (n, n).
         residual: (m,) observation minus its expectation at `mean`, angles wrapped.
-        H: (m, 3) Jacobian of the expectation. R: (m, m) covariance of the observation.
+        H: (m, n) Jacobian of the expectation, or (m, k) by the first k entries of the state, zero beyond.
+        R: (m, m) covariance of the observation.
         threshold: gate on d², from `gate_threshold(probability, m)`; no gate by default.
-        softness: 0 for a gate that decides. Otherwise, in units of d², one that weighs: every observation corrects the
-            belief, with R / w in the place of R, w = 1 / (1 + exp((d² - threshold) / softness)). Near the threshold
-            the correction then changes smoothly, so that derivatives tell what the gate does.
+        temperature: 0 for a gate that decides. Otherwise, in units of d², one that weighs: every observation corrects
+            the belief, with R / w in the place of R, w = 1 / (1 + exp((d² - threshold) / temperature)). Near the
+            threshold the correction then changes smoothly, so that derivatives tell what the gate does.
         valid: () bool; False leaves the belief as it is.
+        angles: entries of the state that are angles, static.
 
     Returns:
         An `Update`; innovation, S, nis and log-likelihood are there whether or not the gate let it in.
@@ -123,28 +155,38 @@ def update(
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shape("residual", residual, (None,))
-    m = len(residual)
-    checks.shapes(mean=(mean, (3,)), cov=(cov, (3, 3)), H=(H, (m, 3)), R=(R, (m, m)))
+    checks.shapes(mean=(mean, (None,)), residual=(residual, (None,)))
+    n, m = len(mean), len(residual)
+    checks.shapes(cov=(cov, (n, n)), H=(H, (m, None)), R=(R, (m, m)))
     checks.shapes(threshold=(threshold, ()), valid=(valid, ()))
-    r = tuple(residual[i] for i in range(m))
-    P = Matrix.symmetric(cov)
-    H, noise = Matrix.of(H), Matrix.symmetric(R)
-    reported = corrected = _correct(P, H, noise, r)
+    H, noise, r = Matrix.of(H), Matrix.symmetric(R), tuple(residual[i] for i in range(m))
+    if H.shape[1] > n:
+        raise ValueError(f"H: expected up to the {n} columns of the state, got {H.shape[1]}")
+    H = Matrix(row + (0,) * (n - len(row)) for row in H.rows)
+    small = n <= SMALL
+    P = Matrix.symmetric(cov) if small else cov
+
+    def correct(noise: Matrix) -> joseph.Corrected:
+        return joseph.correct(P, H, noise, r) if isinstance(P, Matrix) else joseph.correct_array(P, H, noise, residual)
+
+    reported = corrected = correct(noise)
     nis = reported.nis
     accepted = applied = jnp.logical_and(nis < threshold, valid)  # what is no number is not below, gate or none
-    if softness and not (isinstance(threshold, float) and math.isinf(threshold)):
-        weight = jnp.maximum(jax.nn.sigmoid((threshold - nis) / softness), _LEAST_WEIGHT)
-        corrected, applied = _correct(P, H, noise.scale(1 / weight), r), jnp.logical_and(jnp.isfinite(nis), valid)
-    shift = corrected.shift
-    moved = mean[0] + shift[0], mean[1] + shift[1], wrap(mean[2] + shift[2])
+    if temperature and not (isinstance(threshold, float) and math.isinf(threshold)):
+        weight = jnp.maximum(jax.nn.sigmoid((threshold - nis) / temperature), _LEAST_WEIGHT)
+        corrected, applied = correct(noise.scale(1 / weight)), jnp.logical_and(jnp.isfinite(nis), valid)
 
     def chosen(new: Any, old: Any) -> list[jax.Array]:
         return [jnp.where(applied, x, y) for x, y in zip(new, old, strict=True)]
 
+    moved = [x + dx for x, dx in zip(mean, corrected.shift, strict=True)]
+    moved = [wrap(x) if i in angles else x for i, x in enumerate(moved)]
+    rows = P.rows if isinstance(P, Matrix) else P
     return Update(
-        mean=stack(chosen(moved, mean)),
-        cov=stack([chosen(new, old) for new, old in zip(corrected.cov, P.rows, strict=True)]),
+        mean=stack_scalars(chosen(moved, mean)),
+        cov=stack_scalars([chosen(new, old) for new, old in zip(corrected.cov, rows, strict=True)])
+        if small
+        else jnp.where(applied, jnp.asarray(corrected.cov), cov),
         innovation=residual,
         S=Matrix(reported.S).array(cov.dtype),
         nis=nis,
@@ -153,77 +195,5 @@ def update(
     )
 
 
-class _Corrected(NamedTuple):
-    """What an observation makes of a belief, before the gate is asked."""
-
-    shift: tuple[Any, ...]  # of the mean
-    cov: tuple[tuple[Any, ...], ...]  # rows
-    S: tuple[tuple[Any, ...], ...]  # rows
-    nis: Any
-    log_likelihood: Any
-
-
-def _correct(P: Matrix, H: Matrix, R: Matrix, r: tuple[Any, ...]) -> _Corrected:
-    """The correction of `update`, with derivatives written by hand.
-
-    With e = S⁻¹ r and A = I - K H,
-
-        dS = H dP Hᵀ + dH P Hᵀ + (dH P Hᵀ)ᵀ + dR
-        d(K r) = dP Hᵀ e + P dHᵀ e + K (dr - dS e)
-        dP⁺ = A dP Aᵀ + K dR Kᵀ - K dH P Aᵀ - (K dH P Aᵀ)ᵀ
-        d(d²) = 2 eᵀ dr - eᵀ dS e,   d log|S| = tr(S⁻¹ dS)
-
-    There is no dK: the Joseph form is smallest at the gain it is taken at, so to first order it does not change with
-    it. That, and no derivative of a division, is what makes this cheaper than differentiating the code. Source: Gupta
-    & Mehra 1974.
-    """
-    m, (entries, rebuild) = len(r), values((P.rows, H.rows, R.rows, r))
-
-    def gain(P: Matrix, H: Matrix, R: Matrix) -> tuple[Matrix, Matrix, tuple[Any, ...], Matrix, Matrix]:
-        S = sandwich(H, P) + R
-        L, D = ldl(S)
-        K = Matrix(solve(L, D, row) for row in (P @ H.T).rows)  # S is symmetric: row i of K solves S k = (P Hᵀ)_i
-        return S, L, D, K, Matrix.identity(len(P.rows)) - K @ H
-
-    @jax.custom_jvp
-    def correct(entries: list[Any]) -> _Corrected:
-        P, H, R, r = matrices(rebuild(entries))
-        S, L, D, K, A = gain(P, H, R)
-        definite = functools.reduce(jnp.logical_and, [(d > 0) & (d < jnp.inf) for d in D])
-        distance: Any = sum(y * y / d for y, d in zip(forward(L, r), D, strict=True))
-        nis = jnp.where(definite, distance, jnp.nan)
-        log_det = sum(jnp.log(d) for d in D)
-        return _Corrected(
-            shift=column(K @ Matrix([x] for x in r)),
-            cov=(sandwich(A, P) + sandwich(K, R)).rows,
-            S=S.rows,
-            nis=nis,
-            log_likelihood=-0.5 * (nis + log_det + m * math.log(2 * math.pi)),
-        )
-
-    @correct.defjvp
-    def _(primals: Any, tangents: Any) -> tuple[_Corrected, _Corrected]:
-        P, H, R, r = matrices(rebuild(*primals))
-        dP, dH, dR, dr = matrices(rebuild(*tangents, structure=0))
-        _, L, D, K, A = gain(P, H, R)
-        e = solve(L, D, r)
-        E = Matrix([x] for x in e)
-        through_H = dH @ (P @ H.T)
-        dS = sandwich(H, dP) + through_H + through_H.T + dR
-        pull = column(dS @ E)
-        through_A = K @ dH @ (P @ A.T)
-        d_nis = sum(x * (2 * y - z) for x, y, z in zip(e, dr, pull, strict=True))
-        d_log_det = sum(solve(L, D, dS.T.rows[i])[i] for i in range(m))
-        d_shift = dP @ (H.T @ E) + P @ (dH.T @ E) + K @ Matrix([y - z] for y, z in zip(dr, pull, strict=True))
-        d_cov = sandwich(A, dP) + sandwich(K, dR) - through_A - through_A.T
-        tangent = _Corrected(column(d_shift), d_cov.rows, dS.rows, d_nis, -0.5 * (d_nis + d_log_det))
-        return correct(*primals), tangent
-
-    def matrices(rows: Any) -> tuple[Matrix, Matrix, Matrix, tuple[Any, ...]]:
-        P, H, R, r = rows
-        return Matrix(P), Matrix(H), Matrix(R), r
-
-    def column(matrix: Matrix) -> tuple[Any, ...]:
-        return tuple(row[0] for row in matrix.rows)
-
-    return correct(entries)
+def _symmetric(P: jax.Array) -> jax.Array:
+    return 0.5 * (P + P.T)

@@ -1,4 +1,4 @@
-"""How well a map foresees the next scan: what tells a good inverse sensor model from a bad one without a true map.
+"""How well a map predicts the next scan: what tells a good inverse sensor model from a bad one without a true map.
 
 Before a scan goes into the map, the map says of every cell a beam crosses or ends in how likely it is occupied; the
 beam then says whether it was.
@@ -12,15 +12,16 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap._internal.batching import scan, zero_like_any
+from jaxlocmap._internal.batching import scan
 from jaxlocmap.mapping import grid
 from jaxlocmap.mapping.rays import flat_cells, longest_crossing, trace
-from jaxlocmap.types import GridSpec
+from jaxlocmap.se2 import POSE
+from jaxlocmap.types import GridSpec, Scanner
 
 BINS = 10  # of probability
 
 
-class Foresight(NamedTuple):
+class PredictiveScore(NamedTuple):
     """Sums over the cells of beams; a cell that several beams cross counts as often."""
 
     log_loss: jax.Array  # () nats
@@ -31,22 +32,18 @@ class Foresight(NamedTuple):
 
 
 def scan_log_loss(
-    log_odds: jax.Array,
-    pose: jax.Array,
-    ranges: jax.Array,
-    beam_angles: jax.Array,
-    *,
-    spec: GridSpec,
-    min_range: float,
-    max_range: float,
+    log_odds: jax.Array, pose: jax.Array, ranges: jax.Array, *, scanner: Scanner, spec: GridSpec
 ) -> tuple[jax.Array, jax.Array]:
     """Log-loss of a scan under the map before it.
 
         Σ_beams [ Σ_crossed -log(1 - p) - log p_end ],   p = 1 / (1 + exp(-L))
 
     Args:
-        log_odds: (rows, columns) nats; values outside the bounds of `spec` count as at them. pose: (3,) m, m, rad.
-        ranges: (B,) m. beam_angles: (B,) rad, body frame. spec, min_range, max_range: as in `beams.beam_cells`.
+        log_odds: (rows, columns) nats; values outside the bounds of `spec` count as at them.
+        pose: (3,) m, m, rad, of the robot.
+        ranges: (B,) m.
+        scanner: with B beams.
+        spec: static.
 
     Returns:
         () nats, and the number of cells, (). A cell never seen costs log 2. Source: Good 1952 (the score).
@@ -54,7 +51,7 @@ def scan_log_loss(
     Raises:
         ValueError: a wrong shape.
     """
-    return _log_loss(*_before(log_odds, pose, ranges, beam_angles, spec, min_range, max_range))
+    return _log_loss(*_before(log_odds, pose, ranges, scanner, spec))
 
 
 def _log_loss(ends: _Cells, crossed: _Cells) -> tuple[jax.Array, jax.Array]:
@@ -63,58 +60,59 @@ def _log_loss(ends: _Cells, crossed: _Cells) -> tuple[jax.Array, jax.Array]:
     return loss, (jnp.sum(ends.seen) + jnp.sum(crossed.seen)).astype(loss.dtype)
 
 
-def foresee(
+def predict_scans(
     l_occ: jax.Array,
     l_free: jax.Array,
     poses: jax.Array,
     ranges: jax.Array,
     counted: jax.Array,
-    beam_angles: jax.Array,
     *,
+    scanner: Scanner,
     spec: GridSpec,
-    min_range: float,
-    max_range: float,
     bins: bool = False,
-) -> Foresight:
-    """Map scan after scan into an empty map, each judged by the map before it.
+) -> PredictiveScore:
+    """Map scan after scan into an empty map, each predicted by the map before it.
 
     Args:
-        l_occ, l_free: () nats, > 0 and < 0. poses: (T, 3) m, m, rad. ranges: (T, B) m. counted: (T,) bool, the scans
-            that are judged; all are mapped. beam_angles: (B,) rad. spec, min_range, max_range: as in
-            `beams.beam_cells`. bins: fill the bins too, which takes longer; zero otherwise.
+        l_occ: () nats, > 0.
+        l_free: () nats, < 0.
+        poses: (T, 3) m, m, rad, of the robot.
+        ranges: (T, B) m.
+        counted: (T,) bool, the scans that are scored; all are mapped.
+        scanner: with B beams.
+        spec: static.
+        bins: fill the bins too, which takes longer; zero otherwise.
 
     Returns:
-        `Foresight` of this drive. Its derivative by `l_occ` and `l_free` is exact (zero where a cell sits at a bound
-        of `spec`); by the poses it is zero.
+        `PredictiveScore` of this drive. Its derivative by `l_occ` and `l_free` is exact (zero where a cell sits at a
+        bound of `spec`); by the poses it is zero.
 
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shape("poses", poses, (None, 3))
-    checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
+    checks.shape("poses", poses, (None, POSE))
+    checks.shape("ranges", ranges, (len(poses), len(scanner.beam_angles)))
     checks.shape("counted", counted, (len(poses),))
     dtype = jnp.result_type(l_occ)
-    poses, ranges, beam_angles = (jnp.asarray(x, dtype) for x in (poses, ranges, beam_angles))
-    limits = {"min_range": min_range, "max_range": max_range}
-    zero = zero_like_any(l_occ, l_free, poses, ranges, counted, beam_angles).astype(dtype)
+    poses, ranges, scanner = jax.tree.map(lambda x: jnp.asarray(x, dtype), (poses, ranges, scanner))
 
     def body(
-        carry: tuple[jax.Array, Foresight], now: tuple[jax.Array, ...]
-    ) -> tuple[tuple[jax.Array, Foresight], None]:
-        (log_odds, total), (pose, scan, counts) = carry, now
-        ends, crossed = _before(log_odds, pose, scan, beam_angles, spec, **limits)
+        carry: tuple[jax.Array, PredictiveScore], now: tuple[jax.Array, ...]
+    ) -> tuple[tuple[jax.Array, PredictiveScore], None]:
+        (log_odds, total), (pose, ranges, counts) = carry, now
+        ends, crossed = _before(log_odds, pose, ranges, scanner, spec)
         loss, cells = _log_loss(ends, crossed)
         binned = (total.bin_cells, total.bin_probability, total.bin_hits)
         if bins:
             more = _binned(ends, crossed)
             binned = tuple(a + jnp.where(counts, b, 0) for a, b in zip(binned, more, strict=True))
-        total = Foresight(
+        total = PredictiveScore(
             total.log_loss + jnp.where(counts, loss, 0), total.cells + jnp.where(counts, cells, 0), *binned
         )
-        return (grid.add_scan(log_odds, pose, scan, beam_angles, l_occ, l_free, spec=spec, **limits), total), None
+        return (grid.add_scan(log_odds, pose, ranges, l_occ, l_free, scanner=scanner, spec=spec), total), None
 
-    none = jnp.full(BINS, zero)
-    start = (jnp.full(spec.shape, zero), Foresight(zero, zero, none, none, none))
+    zero, none = jnp.zeros((), dtype), jnp.zeros(BINS, dtype)
+    start = (jnp.zeros(spec.shape, dtype), PredictiveScore(zero, zero, none, none, none))
     return scan(body, start, (poses, ranges, counted))[0][1]
 
 
@@ -124,25 +122,19 @@ class _Cells(NamedTuple):
 
 
 def _before(
-    log_odds: jax.Array,
-    pose: jax.Array,
-    ranges: jax.Array,
-    beam_angles: jax.Array,
-    spec: GridSpec,
-    min_range: float,
-    max_range: float,
+    log_odds: jax.Array, pose: jax.Array, ranges: jax.Array, scanner: Scanner, spec: GridSpec
 ) -> tuple[_Cells, _Cells]:
     """What the map says of the cells that beams end in (B,) and cross (B, K)."""
     checks.shape("log_odds", log_odds, spec.shape)
-    lines = trace(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
-    j = jnp.arange(longest_crossing(spec, max_range), dtype=jnp.int32)[None]
+    rays = trace(pose, ranges, scanner, spec=spec)
+    j = jnp.arange(longest_crossing(spec, scanner.max_range), dtype=jnp.int32)[None]
 
     def said(cells: jax.Array, seen: jax.Array) -> _Cells:
         there = jnp.where(seen, cells, 0)
         return _Cells(jnp.clip(log_odds.ravel()[there], spec.l_min, spec.l_max), seen)
 
-    ends = said(flat_cells(lines, lines.last[:, None], spec)[:, 0], lines.last >= 0)
-    return ends, said(flat_cells(lines, j, spec), j < lines.free[:, None])
+    ends = said(flat_cells(rays, rays.last[:, None], spec)[:, 0], rays.last >= 0)
+    return ends, said(flat_cells(rays, j, spec), j < rays.free[:, None])
 
 
 def _binned(ends: _Cells, crossed: _Cells) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -15,7 +15,8 @@ import numpy as np
 
 from jaxlocmap import checks
 from jaxlocmap._internal.trig import sin_cos
-from jaxlocmap.types import GridSpec
+from jaxlocmap.se2 import POSE, compose
+from jaxlocmap.types import GridSpec, Scanner
 
 # Beams of up to so many cells, on maps of up to so many, float32 places exactly; others take integer divisions.
 _EXACT_SPAN, _EXACT_MAP = 1024, 1 << 24
@@ -32,14 +33,37 @@ class Beams(NamedTuple):
     hit: jax.Array  # (B, K) bool: the beam ends in this cell, and it lies on the map
 
 
-class Lines(NamedTuple):
-    """What is to be known of each of B beams to place its cells. From the robot's, cell j of a beam lies
-    ceil(j span / n - 1/2) cells away along x and y, ties towards the robot, n being the larger span.
+class Slopes(NamedTuple):
+    """How the cells of B beams follow each other, for beams and maps that float32 places exactly."""
+
+    slope: jax.Array  # (2, B) float32: span / n along x and y
+    offset: jax.Array  # (2, B) float32, such that floor(j slope + offset) = ceil(j span / n - 1/2)
+
+    def along(self, axis: int, j: jax.Array) -> jax.Array:
+        """How many cells away cell j of every beam lies along an axis: (B, K) whole numbers."""
+        return jnp.floor(j.astype(self.slope.dtype) * self.slope[axis, :, None] + self.offset[axis, :, None])
+
+
+class Spans(NamedTuple):
+    """The same for longer beams and larger maps, in integers."""
+
+    span: jax.Array  # (2, B) int32: cells from the scanner's to the beam's last along x and y
+    n: jax.Array  # (B,) int32: the larger of their magnitudes, at least 1
+
+    def along(self, axis: int, j: jax.Array) -> jax.Array:
+        """How many cells away cell j of every beam lies along an axis: (B, K) whole numbers."""
+        span, n = self.span[axis, :, None], self.n[:, None]
+        whole, rest = _times_over(j, jnp.abs(span), n)
+        return jnp.sign(span) * (whole + (2 * rest > n).astype(jnp.int32))
+
+
+class Rays(NamedTuple):
+    """What is to be known of each of B beams to place its cells. From the scanner's, cell j of a beam lies
+    ceil(j span / n - 1/2) cells away along x and y, ties towards the scanner, n being the larger span.
     """
 
-    start: jax.Array  # (2,) int32: column and row of the robot
-    slope: jax.Array  # (2, B) span / n; or, for very long beams, the span itself, int32
-    offset: jax.Array  # (2, B) such that floor(j slope + offset) is that ceiling; or n
+    start: jax.Array  # (2,) int32: column and row of the scanner
+    steps: Slopes | Spans
     free: jax.Array  # (B,) int32: so many cells are crossed and lie on the map, the first ones
     last: jax.Array  # (B,) int32: the j of the cell the beam ends in, -1 where it ends in none
 
@@ -69,50 +93,38 @@ def on_map(pose: jax.Array, spec: GridSpec) -> jax.Array:
     return (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & jnp.isfinite(pose[2])
 
 
-def beam_cells(
-    pose: jax.Array,
-    ranges: jax.Array,
-    beam_angles: jax.Array,
-    *,
-    spec: GridSpec,
-    min_range: float,
-    max_range: float,
-) -> Beams:
+def beam_cells(pose: jax.Array, ranges: jax.Array, scanner: Scanner, *, spec: GridSpec) -> Beams:
     """The cells every beam of a scan crosses and ends in (Bresenham 1965), all beams at once.
 
     Cell j of a beam that spans n cells along its major axis and m along its minor lies at j along the major and
     ceil(j m / n - 1/2) along the minor axis.
 
     Args:
-        pose: (3,) m, m, rad. ranges: (B,) m. beam_angles: (B,) rad, body frame.
-        min_range: a range at or below is no measurement; nor is one that is not finite.
-        max_range: a range at or above clears up to here and ends in no cell.
+        pose: (3,) m, m, rad, of the robot.
+        ranges: (B,) m. At or below the scanner's `min_range`, or not finite, it is no measurement; at or above its
+            `max_range` it clears up to there and ends in no cell.
+        scanner: with B beams.
+        spec: static.
 
     Returns:
-        `Beams`; nothing is free or hit for a robot outside the map, nor beyond the edge.
+        `Beams`; nothing is free or hit for a scanner outside the map, nor beyond the edge.
 
     Raises:
         ValueError: a wrong shape, or a `max_range` of more than about a million cells.
     """
-    lines = trace(pose, ranges, beam_angles, spec=spec, min_range=min_range, max_range=max_range)
-    j = jnp.arange(longest(spec, max_range), dtype=jnp.int32)[None]
-    column, row = cells_at(lines, j)
-    return Beams(row, column, free=j < lines.free[:, None], hit=j == lines.last[:, None])
+    rays = trace(pose, ranges, scanner, spec=spec)
+    j = jnp.arange(longest(spec, scanner.max_range), dtype=jnp.int32)[None]
+    column, row = cells_at(rays, j)
+    return Beams(row, column, free=j < rays.free[:, None], hit=j == rays.last[:, None])
 
 
-def trace(
-    pose: jax.Array,
-    ranges: jax.Array,
-    beam_angles: jax.Array,
-    *,
-    spec: GridSpec,
-    min_range: float,
-    max_range: float,
-) -> Lines:
-    """The straight lines of a scan; arguments and errors as in `beam_cells`."""
-    checks.shape("pose", pose, (3,))
+def trace(pose: jax.Array, ranges: jax.Array, scanner: Scanner, *, spec: GridSpec) -> Rays:
+    """The rays of a scan; arguments and errors as in `beam_cells`."""
+    beam_angles, min_range, max_range = scanner.beam_angles, scanner.min_range, scanner.max_range
+    checks.shape("pose", pose, (POSE,))
     checks.shape("beam_angles", beam_angles, (None,))
     checks.shape("ranges", ranges, np.shape(beam_angles))
+    pose, _ = compose(pose, scanner.offset)
     limit = _span_limit(spec, max_range)
     if limit > _LONGEST_SPAN:
         raise ValueError(
@@ -134,23 +146,20 @@ def trace(
     # A straight line that has left the map does not come back: its cells on the map are its first.
     sides = zip(spans, start, spec.shape[::-1], strict=True)
     inside = jnp.minimum(*(_cells_inside(m, n, first, cells, exact) for m, first, cells in sides))
-    slope, offset = _steps(jnp.stack(spans), jnp.maximum(n, 1)[None], exact)
-    return Lines(
+    return Rays(
         start,
-        slope,
-        offset,
+        _steps(jnp.stack(spans), jnp.maximum(n, 1), exact),
         free=jnp.where(measured, jnp.minimum(n, inside), 0),
         last=jnp.where(measured & (ranges < max_range) & (n < inside), n, -1),
     )
 
 
-def _steps(span: jax.Array, n: jax.Array, exact: bool) -> tuple[jax.Array, jax.Array]:
-    """Slope and offset of `Lines`."""
+def _steps(span: jax.Array, n: jax.Array, exact: bool) -> Slopes | Spans:
     if not exact:
-        return span, n
+        return Spans(span, n)
     # The argument of the floor stays 1 / (4 n) away from every integer, more than a float32 product is off by.
     share = 1 / n.astype(jnp.float32)
-    return span.astype(jnp.float32) * share, 0.5 - 0.25 * share * jnp.sign(span).astype(jnp.float32)
+    return Slopes(span.astype(jnp.float32) * share, 0.5 - 0.25 * share * jnp.sign(span).astype(jnp.float32))
 
 
 def _cells_inside(m: jax.Array, n: jax.Array, start: jax.Array, cells: int, exact: bool) -> jax.Array:
@@ -178,7 +187,7 @@ def _times_over(a: jax.Array, b: jax.Array, c: jax.Array) -> tuple[jax.Array, ja
     return (high * whole + more).astype(jnp.int32), rest.astype(jnp.int32)
 
 
-def cells_at(lines: Lines, j: jax.Array) -> tuple[jax.Array, jax.Array]:
+def cells_at(rays: Rays, j: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Column and row of cell j of every beam.
 
     Args:
@@ -187,25 +196,15 @@ def cells_at(lines: Lines, j: jax.Array) -> tuple[jax.Array, jax.Array]:
     Returns:
         (B, K) int32 each.
     """
-    column, row = (lines.start[axis] + _along(lines, axis, j).astype(jnp.int32) for axis in (0, 1))
+    column, row = (rays.start[axis] + rays.steps.along(axis, j).astype(jnp.int32) for axis in (0, 1))
     return column, row
 
 
-def flat_cells(lines: Lines, j: jax.Array, spec: GridSpec) -> jax.Array:
+def flat_cells(rays: Rays, j: jax.Array, spec: GridSpec) -> jax.Array:
     """Flat index, row * columns + column, of cell j of every beam, (B, K) int32; j as in `cells_at`."""
     columns = spec.shape[1]
-    across, up = (_along(lines, axis, j) for axis in (0, 1))
-    return lines.start[0] + columns * lines.start[1] + (across + columns * up).astype(jnp.int32)
-
-
-def _along(lines: Lines, axis: int, j: jax.Array) -> jax.Array:
-    """How many cells away cell j of every beam lies along an axis: whole numbers, of either type."""
-    slope = lines.slope[axis, :, None]
-    if jnp.issubdtype(slope.dtype, jnp.floating):
-        return jnp.floor(j.astype(slope.dtype) * slope + lines.offset[axis, :, None])
-    n = lines.offset[0, :, None]
-    whole, rest = _times_over(j, jnp.abs(slope), n)
-    return jnp.sign(slope) * (whole + (2 * rest > n).astype(jnp.int32))
+    across, up = (rays.steps.along(axis, j) for axis in (0, 1))
+    return rays.start[0] + columns * rays.start[1] + (across + columns * up).astype(jnp.int32)
 
 
 def longest(spec: GridSpec, max_range: float) -> int:
@@ -219,5 +218,5 @@ def longest_crossing(spec: GridSpec, max_range: float) -> int:
 
 
 def _span_limit(spec: GridSpec, max_range: float) -> int:
-    """Cells from a robot to the end of its longest beam, one spare for rounding."""
+    """Cells from a scanner to the end of its longest beam, one spare for rounding."""
     return math.ceil(max_range / spec.resolution) + 1

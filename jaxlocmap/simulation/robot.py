@@ -1,9 +1,8 @@
 """Simulated robots: keys in, `Truth` and `Inputs` out.
 
-A world is data (walls, landmarks), so is the plant's noise; both may differ from run to run under `vmap`. What the
-filter believes, its `Params`, is no part of a simulation. `drive`, `sight` and `look_round` each make one step out of
-given random numbers, so that a study can simulate and filter in one loop and keep neither; `roll_out` makes a whole
-drive of them, also for a program with a generator of its own.
+`drive`, `detect` and `simulate_scan` each make one step out of given random numbers, so that a study can simulate and
+filter in one loop and keep neither; `roll_out` makes a whole drive of them, also for a program with a generator of its
+own.
 """
 
 from __future__ import annotations
@@ -13,143 +12,201 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap import checks
+from jaxlocmap import checks, sensors
 from jaxlocmap._internal import batching
-from jaxlocmap._internal.random import Words, normals, uniforms, words_of
+from jaxlocmap._internal.random import Words, lanes, normals, uniforms, words_of
 from jaxlocmap._internal.trig import arctan2, sin_cos
-from jaxlocmap.motion import wrap
-from jaxlocmap.sensors import sensor_pose
+from jaxlocmap.se2 import POSE, compose, wrap
+from jaxlocmap.sensors import Sensor
 from jaxlocmap.simulation.scenario import Noise, Scenario
 from jaxlocmap.simulation.world import World, ray_cast
 from jaxlocmap.types import Gaussian, Inputs, Truth
+
+_ON_A_WALL = 1e-3  # m: a landmark this close behind a wall hangs on it
 
 
 class Draws(NamedTuple):
     """The random numbers of a drive; what they are for is said where they are used."""
 
-    drive: jax.Array  # (T, 3)
-    sighting: jax.Array  # (T, L, 2), or (T, L, 5) with outliers; used at the steps at which the detector looks
+    drive: jax.Array  # (T, 3), or (T, q) for a plant with q inputs
+    detection: jax.Array  # (T, L, m), or (T, L, 2 m + 1) with outliers; used where the detector is active
     scan: jax.Array | None = None  # (T, B); None without a scanner
 
 
 # Where each use of a step's random numbers begins.
-_DRIVE, _SIGHTINGS, _SCAN = 0, 1 << 20, 1 << 30
+_DRIVE, _DETECTIONS, _SCAN = 0, 1 << 20, 1 << 30
 
 
-def draw_pose(key: jax.Array, prior: Gaussian) -> jax.Array:
-    """A true pose (3,), m, m, rad, from the prior, so that the prior is honest.
+def draw_state(key: jax.Array, prior: Gaussian) -> jax.Array:
+    """A true state (n,) from the prior, so that the prior is honest.
 
     To start exactly where the filter believes, use `prior.mean`.
 
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(mean=(prior.mean, (3,)), cov=(prior.cov, (3, 3)))
+    checks.shape("mean", prior.mean, (None,))
+    n = len(prior.mean)
+    checks.shape("cov", prior.cov, (n, n))
     variance, axes = jnp.linalg.eigh(prior.cov)  # unlike Cholesky, content with a variance of zero
-    spread = jnp.sqrt(jnp.maximum(variance, 0)) * jax.random.normal(key, (3,), prior.mean.dtype)
-    pose = prior.mean + axes @ spread
-    return pose.at[2].set(wrap(pose[2]))
+    spread = jnp.sqrt(jnp.maximum(variance, 0)) * jax.random.normal(key, (n,), prior.mean.dtype)
+    state = prior.mean + axes @ spread
+    return state.at[2].set(wrap(state[2]))
 
 
-def draw_drive(words: Words, k: jax.Array, dtype: Any) -> jax.Array:
-    """Random numbers for `drive` at step k, (3,). words: of this drive alone, from `normals.words_of`.
+def draw_drive(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
+    """Random numbers for `drive` at step k, (3,) or (q,). words: of this drive alone, from `random.words_of`.
 
     Raises:
         ValueError: a wrong shape.
     """
     checks.shape("k", k, ())
-    return normals(words, k, _DRIVE, 3, dtype)
+    return normals(words, k, _DRIVE, _drive_draws(scenario), dtype)
 
 
 def drive(
-    draws: jax.Array, k: jax.Array, pose: jax.Array, noise: Noise, *, scenario: Scenario
+    draws: jax.Array, k: jax.Array, state: jax.Array, noise: Noise, *, scenario: Scenario
 ) -> tuple[jax.Array, jax.Array]:
-    """One step of the plant.
+    """One step of the robot. Without `Scenario.plant` that of the course:
 
         x ← x + v cos(theta) dt,  y ← y + v sin(theta) dt,  theta ← wrap(theta + omega dt + heading noise)
 
+    with noise on the control as it is measured. With a plant its transition, x ← f(x, u, dt), under an input u that is
+    the command, which is what the robot measures, plus noise.
+
     Args:
-        draws: (3,) standard normals: for heading, v, omega. k: () step, from 0. pose: (3,) m, m, rad, the true pose
-            before. noise: as its fields say. scenario: static.
+        draws: (3,) standard normals for heading, v, omega; or (q,), for the inputs of the plant.
+        k: () step, from 0.
+        state: (n,), the true one before, beginning with the pose in m, m, rad.
+        noise: as its fields say.
+        scenario: static.
 
     Returns:
-        The true pose (3,), and the commanded control with noise (2,), as the robot measures it.
+        The true state (n,), and the control (c,) as the robot measures it.
 
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(draws=(draws, (3,)), k=(k, ()), pose=(pose, (3,)))
+    checks.shapes(draws=(draws, (_drive_draws(scenario),)), k=(k, ()), state=(state, (scenario.dim,)))
     _check_noise(noise)
-    v, w = scenario.command(k, pose)
-    sin, cos = sin_cos(pose[2])
+    command, dt = scenario.command(k, state[:POSE]), scenario.dt
+    if (plant := scenario.plant) is not None:
+        std = [x for block in plant.noise for x in noise.std(block)]
+        u = plant.full_input(command) + jnp.stack([s * draws[i] for i, s in enumerate(std)])
+        return plant.transition(state, u, jnp.asarray(dt, state.dtype)), command
+    v, w = command
+    sin, cos = sin_cos(state[2])
     moved = [
-        pose[0] + v * cos * scenario.dt,
-        pose[1] + v * sin * scenario.dt,
-        wrap(pose[2] + w * scenario.dt + noise.heading * draws[0]),
+        state[0] + v * cos * dt,
+        state[1] + v * sin * dt,
+        wrap(state[2] + w * dt + noise.heading * draws[0]),
     ]
     return jnp.stack(moved), jnp.stack([v + noise.v * draws[1], w + noise.w * draws[2]])
 
 
-def draw_sighting(words: Words, k: jax.Array, j: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
-    """Random numbers for `sight` of landmark j at step k, (2,) or, with outliers, (5,).
+def _drive_draws(scenario: Scenario) -> int:
+    return 3 if scenario.plant is None else scenario.plant.inputs
+
+
+def targets(world: World, *, scenario: Scenario) -> jax.Array:
+    """What the sensor reports, one slot each: the landmarks (L, 2) m; for one that observes none, a single slot."""
+    return world.landmarks if _sensor(scenario).landmarks else jnp.zeros((1, 2), world.landmarks.dtype)
+
+
+def draw_detection(words: Words, k: jax.Array, j: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
+    """Random numbers for `detect` of target j at step k, (m,) or, with outliers, (2 m + 1,).
 
     Raises:
         ValueError: a wrong shape.
     """
     checks.shapes(k=(k, ()), j=(j, ()))
-    normal = normals(words, k, _SIGHTINGS + 4 * j, 2, dtype)
-    if not scenario.outliers:
+    m = _sensor(scenario).dim
+    first = _DETECTIONS + max(lanes(m) + lanes(m + 1), 4) * j
+    normal = normals(words, k, first, m, dtype)
+    if not scenario.detector.outliers:
         return normal
-    uniform = uniforms(words, k, _SIGHTINGS + 4 * j + 1, 3, dtype)
+    uniform = uniforms(words, k, first + lanes(m), m + 1, dtype)
     return jnp.stack([*normal, *uniform])
 
 
-def sight(
-    draws: jax.Array, pose: jax.Array, landmark: jax.Array, noise: Noise, *, scenario: Scenario
+def detect(
+    draws: jax.Array, state: jax.Array, landmark: jax.Array, world: World, noise: Noise, *, scenario: Scenario
 ) -> tuple[jax.Array, jax.Array]:
-    """What the detector makes of a landmark.
+    """What the robot's sensor makes of a landmark.
 
-    Whether it reports one is decided by the true distance: a cut of what it measures would let through more of the
-    readings that came out short, and noise so picked is no longer the noise that it has.
+    Whether it reports one is decided by where the landmark truly is: a cut of what it measures would let through more
+    of the readings that came out short, and noise so picked is no longer the noise that it has.
 
     Args:
-        draws: (2,) standard normals for range and bearing; with `scenario.outliers` (5,), then uniform over (0, 1):
-            whether the sighting is false, and of what range and bearing.
-        pose: (3,) m, m, rad, the true one. landmark: (2,) m. noise: as its fields say. scenario: static.
+        draws: (m,) standard normals for the components of an observation; with `Detector.outliers` (2 m + 1,), then
+            uniform over (0, 1): whether the observation is false, and what each component then is.
+        state: (n,), the true one, beginning with the pose in m, m, rad.
+        landmark: (2,) m. A sensor that observes none takes no notice.
+        world, noise: as their fields say.
+        scenario: static.
 
     Returns:
-        Range and bearing (2,) m, rad, and whether the detector reports them, which it does of landmarks nearer than
-        `sight_range`. Within a few deviations of a landmark noise can make the range negative; the filter then leaves
-        it out.
+        The observation (m,), and () bool whether the detector reports it: landmarks between its ranges and in its field
+        of view. Within a few standard deviations of a landmark noise can make a range negative; the filter then leaves
+        it out. Ranges of a false observation lie within reach, angles anywhere, the rest within reach of the truth.
 
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(draws=(draws, (_sighting_draws(scenario),)), landmark=(landmark, (2,)))
+    sensor, detector = _sensor(scenario), scenario.detector
+    checks.shapes(draws=(draws, (_detection_draws(scenario),)), state=(state, (None,)), landmark=(landmark, (2,)))
     _check_noise(noise)
-    x, y, heading, _ = sensor_pose(pose, scenario.sensor_offset)
-    dx, dy = landmark[0] - x, landmark[1] - y
+    pose, _ = compose(state[:POSE], scenario.robot.sensor_offset)
+    mounted = pose if len(state) == POSE else jnp.concatenate([pose, state[POSE:]])
+    std, m = noise.std(sensor.noise), sensor.dim
+    exact = sensor.expected(mounted, landmark if sensor.landmarks else None)
+    z = [exact[i] + std[i] * draws[i] for i in range(m)]
+    if detector.outliers:  # of what it reports, so that the rate is the share
+        false = draws[m] < noise.outlier_rate
+        z = [jnp.where(false, _false(sensor, i, exact, draws[m + 1 + i], detector.max_range), z[i]) for i in range(m)]
+    z = jnp.stack([wrap(x) if i in sensor.angles else x for i, x in enumerate(z)])
+    if not sensor.landmarks:
+        return z, jnp.array(True)
+    return z, _is_detected(pose, landmark, world, scenario)
+
+
+def _false(sensor: Sensor, i: int, exact: jax.Array, uniform: jax.Array, reach: float) -> jax.Array:
+    if i in sensor.angles:
+        return (2 * uniform - 1) * jnp.pi
+    return uniform * reach if i in sensor.positive else exact[i] + (2 * uniform - 1) * reach
+
+
+def _is_detected(pose: jax.Array, landmark: jax.Array, world: World, scenario: Scenario) -> jax.Array:
+    detector = scenario.detector
+    dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
     distance = jnp.sqrt(dx * dx + dy * dy)
-    near = distance < scenario.sight_range
-    reach = distance + noise.range * draws[0]
-    bearing = arctan2(dy, dx) - heading + noise.bearing * draws[1]
-    if scenario.outliers:  # of what it reports, so that the rate is the share
-        false = draws[2] < noise.outlier_rate
-        reach = jnp.where(false, draws[3] * scenario.sight_range, reach)
-        bearing = jnp.where(false, (2 * draws[4] - 1) * jnp.pi, bearing)
-    return jnp.stack([reach, wrap(bearing)]), near
+    detected = distance < detector.max_range
+    if detector.min_range > 0:
+        detected = detected & (distance >= detector.min_range)
+    bearing = wrap(arctan2(dy, dx) - pose[2])
+    if detector.field_of_view < 2 * jnp.pi:
+        detected = detected & (jnp.abs(bearing) <= detector.field_of_view / 2)
+    if detector.occlusion:
+        wall = ray_cast(pose, bearing[None], world.segments, detector.max_range)[0]
+        detected = detected & (distance < wall + _ON_A_WALL)
+    return detected
 
 
-def _sighting_draws(scenario: Scenario) -> int:
-    return 5 if scenario.outliers else 2
+def _sensor(scenario: Scenario) -> Sensor:
+    return sensors.resolve(scenario.robot.sensor)
+
+
+def _detection_draws(scenario: Scenario) -> int:
+    m = _sensor(scenario).dim
+    return 2 * m + 1 if scenario.detector.outliers else m
 
 
 def _check_noise(noise: Noise) -> None:
-    checks.shapes(**{f"noise.{name}": (value, ()) for name, value in noise._asdict().items()})
+    checks.shapes(**{f"noise.{name}": (x, ()) for name, x in noise._asdict().items() if name != "blocks"})
 
 
 def draw_scan(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
-    """Random numbers for `look_round` at step k, (B,).
+    """Random numbers for `simulate_scan` at step k, (B,).
 
     Raises:
         ValueError: a wrong shape.
@@ -158,20 +215,24 @@ def draw_scan(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> 
     return normals(words, k, _SCAN, scenario.beams, dtype)
 
 
-def look_round(draws: jax.Array, pose: jax.Array, world: World, noise: Noise, *, scenario: Scenario) -> jax.Array:
+def simulate_scan(draws: jax.Array, state: jax.Array, world: World, noise: Noise, *, scenario: Scenario) -> jax.Array:
     """A scan of the walls, (B,) m. Noise is added after the cut at `max_range`, as the course has it.
 
     Args:
-        draws: (B,) standard normals. pose: (3,) m, m, rad, the true one. world, noise: as their fields say.
+        draws: (B,) standard normals.
+        state: (n,), the true one, beginning with the pose in m, m, rad.
+        world, noise: as their fields say.
+        scenario: static.
 
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shape("draws", draws, (scenario.beams,))
+    checks.shapes(draws=(draws, (scenario.beams,)), state=(state, (None,)))
     _check_noise(noise)
-    angles = scenario.beam_angles().astype(pose.dtype)
-    exact = ray_cast(pose, angles, world.segments, scenario.max_range)
-    return jnp.maximum(exact + draws * noise.scan, scenario.min_range)
+    scanner = scenario.robot.scanner(scenario.beam_angles().astype(state.dtype))
+    pose, _ = compose(state[:POSE], scanner.offset)
+    exact = ray_cast(pose, scanner.beam_angles, world.segments, scanner.max_range)
+    return jnp.maximum(exact + draws * noise.scan, scanner.min_range)
 
 
 def simulate(
@@ -186,26 +247,28 @@ def simulate(
     """One drive.
 
     Args:
-        key: of this drive alone. world, noise: as their fields say.
-        start: (3,) m, m, rad, the true pose at step -1: the prior's mean, or one from `draw_pose`. Its dtype is that
-            of everything that follows.
-        scenario: static. scan: False leaves out the scanner, which costs most of a simulation.
+        key: of this drive alone.
+        world, noise: as their fields say.
+        start: (n,), the true state at step -1, beginning with the pose in m, m, rad: the prior's mean, or one from
+            `draw_state`. Its dtype is that of everything that follows.
+        scenario: static.
+        scan: False leaves out the scanner, which costs most of a simulation.
 
     Returns:
-        The true poses and what the robot measured, both with a leading axis T: the control with noise; every
-        `sight_period` steps, landmarks in reach, slot j holding landmark j; a scan a step.
+        The true states and what the robot measured, both with a leading axis T: the control; at the steps at which the
+        detector is active, what it detects, slot j holding landmark j; a scan a step.
 
     Raises:
         ValueError: a wrong shape; a batch of drives is a `vmap`.
     """
-    checks.shapes(start=(start, (3,)), landmarks=(world.landmarks, (None, 2)))
+    _check_start(start, world, scenario)
     checks.shape("key", key, () if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else (None,))
-    words, dtype, landmarks = words_of(key), start.dtype, jnp.arange(len(world.landmarks))
+    words, dtype, slots = words_of(key), start.dtype, jnp.arange(len(targets(world, scenario=scenario)))
 
     def numbers(k: jax.Array) -> Draws:
         return Draws(
-            drive=draw_drive(words, k, dtype),
-            sighting=jax.vmap(lambda j: draw_sighting(words, k, j, scenario=scenario, dtype=dtype))(landmarks),
+            drive=draw_drive(words, k, scenario=scenario, dtype=dtype),
+            detection=jax.vmap(lambda j: draw_detection(words, k, j, scenario=scenario, dtype=dtype))(slots),
             scan=draw_scan(words, k, scenario=scenario, dtype=dtype) if scan else None,
         )
 
@@ -218,28 +281,32 @@ def roll_out(draws: Draws, world: World, noise: Noise, start: jax.Array, *, scen
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(start=(start, (3,)), landmarks=(world.landmarks, (None, 2)))
-    checks.shape("draws.drive", draws.drive, (scenario.steps, 3))
-    sightings = (scenario.steps, len(world.landmarks), _sighting_draws(scenario))
-    checks.shape("draws.sighting", draws.sighting, sightings)
+    _check_start(start, world, scenario)
+    landmarks = targets(world, scenario=scenario)
+    checks.shape("draws.drive", draws.drive, (scenario.steps, _drive_draws(scenario)))
+    checks.shape("draws.detection", draws.detection, (scenario.steps, len(landmarks), _detection_draws(scenario)))
     if draws.scan is not None:
         checks.shape("draws.scan", draws.scan, (scenario.steps, scenario.beams))
 
-    def body(pose: jax.Array, now: tuple[jax.Array, Draws]) -> tuple[jax.Array, tuple[Truth, Inputs]]:
+    def body(state: jax.Array, now: tuple[jax.Array, Draws]) -> tuple[jax.Array, tuple[Truth, Inputs]]:
         k, draws = now
-        pose, control = drive(draws.drive, k, pose, noise, scenario=scenario)
-        z, near = jax.vmap(lambda d, landmark: sight(d, pose, landmark, noise, scenario=scenario))(
-            draws.sighting, world.landmarks
+        state, control = drive(draws.drive, k, state, noise, scenario=scenario)
+        z, detected = jax.vmap(lambda d, landmark: detect(d, state, landmark, world, noise, scenario=scenario))(
+            draws.detection, landmarks
         )
-        valid = near & scenario.looks(k)
+        valid = detected & scenario.detector.active(k)
         inputs = Inputs(
-            dt=jnp.asarray(scenario.dt, pose.dtype),
+            dt=jnp.asarray(scenario.dt, state.dtype),
             control=control,
             landmark=jnp.arange(len(valid), dtype=jnp.int32),
             z=jnp.where(valid[:, None], z, 0),
             valid=valid,
-            ranges=None if draws.scan is None else look_round(draws.scan, pose, world, noise, scenario=scenario),
+            ranges=None if draws.scan is None else simulate_scan(draws.scan, state, world, noise, scenario=scenario),
         )
-        return pose, (Truth(pose), inputs)
+        return state, (Truth(state), inputs)
 
     return batching.scan(body, start, (jnp.arange(scenario.steps), draws))[1]
+
+
+def _check_start(start: jax.Array, world: World, scenario: Scenario) -> None:
+    checks.shapes(start=(start, (scenario.dim,)), landmarks=(world.landmarks, (None, 2)))

@@ -1,30 +1,80 @@
-"""Scenarios: a drive, the sensors on board, and the noise of both. What the filter believes is no part of them."""
+"""Scenarios: a drive, the robot that drives it, and the noise of both. What the filter believes is no part of them."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlocmap import motion, sensors
 from jaxlocmap._internal.trig import arctan2
-from jaxlocmap.motion import wrap
-from jaxlocmap.types import Config, Gaussian, GridSpec, Params, check_offset, freeze_tuples
+from jaxlocmap.motion import MotionModel
+from jaxlocmap.parameters import Block, Q, R
+from jaxlocmap.se2 import POSE, wrap
+from jaxlocmap.types import Config, Gaussian, GridSpec, Params
 
 
 class Noise(NamedTuple):
-    """Standard deviations of the plant and its sensors: the truth that `Params` tries to describe."""
+    """Standard deviations of the robot and its sensors: the truth that `Params` tries to describe."""
 
-    heading: jax.Array | float = 0.005  # rad a step, what the plant adds to its turn
+    heading: jax.Array | float = 0.005  # rad a step, what the plant of the course adds to its turn
     v: jax.Array | float = 0.02  # m/s, measured speed against commanded
     w: jax.Array | float = 0.01  # rad/s, measured yaw rate against commanded
     range: jax.Array | float = 0.08  # m, landmark detector
     bearing: jax.Array | float = 0.02  # rad, landmark detector
     scan: jax.Array | float = 0.03  # m, each beam
-    outlier_rate: jax.Array | float = 0.0  # share of sightings that are false, where `Scenario.outliers`
+    outlier_rate: jax.Array | float = 0.0  # share of observations that are false, where `Detector.outliers`
+    blocks: Mapping[str, Any] = {}  # (m,) or (), of the components of other blocks, by `Block.name`
+
+    def std(self, block: Block) -> list[Any]:
+        """Of the components of a block, () each.
+
+        Raises:
+            ValueError: no or another number of them.
+        """
+        if block == Q:
+            return [self.v, self.w]
+        if block == R:
+            return [self.range, self.bearing]
+        std, m = self.blocks.get(block.name), len(block.components)
+        if std is None or np.shape(std) not in ((m,), ()):
+            got = "none" if std is None else f"shape {np.shape(std)}"
+            raise ValueError(f"noise.blocks[{block.name!r}]: expected {m} standard deviations, got {got}")
+        return [std[i] for i in range(m)] if np.ndim(std) else [std] * m
+
+
+@dataclasses.dataclass(frozen=True)
+class Detector:
+    """When the robot's sensor reports a landmark. Frozen and hashable, so static under jit.
+
+    Raises:
+        ValueError: a period below one step, a reach that is none, or a field of view outside (0, 2π].
+    """
+
+    max_range: float = 7.5  # m: landmarks nearer than this are reported
+    min_range: float = 0.0  # m: unless nearer than this
+    field_of_view: float = 2 * math.pi  # rad, centred on the sensor's heading
+    period: int = 5  # steps between two detections, the first at step 0
+    occlusion: bool = False  # walls hide the landmarks behind them
+    outliers: bool = False  # some observations are false: ranges anywhere within reach, angles anywhere
+
+    def __post_init__(self) -> None:
+        if self.period < 1:
+            raise ValueError(f"Detector.period: expected at least 1 step, got {self.period}")
+        if not 0 <= self.min_range < self.max_range:
+            got = f"{self.min_range}, {self.max_range}"
+            raise ValueError(f"Detector.min_range, max_range: expected 0 <= min_range < max_range, got {got}")
+        if not 0 < self.field_of_view <= 2 * math.pi:
+            raise ValueError(f"Detector.field_of_view: expected an angle in (0, 2π], got {self.field_of_view}")
+
+    def active(self, k: jax.Array) -> jax.Array:
+        """Whether the detector reports anything at step k."""
+        return k % self.period == 0
 
 
 _COURSE_GRID = GridSpec(origin=(0.0, 0.0), resolution=0.2, shape=(120, 120))
@@ -32,60 +82,67 @@ _COURSE_GRID = GridSpec(origin=(0.0, 0.0), resolution=0.2, shape=(120, 120))
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """A drive and the sensors on board. Frozen and hashable, so static under jit.
+    """A drive and the robot that drives it. Frozen and hashable, so static under jit.
 
     Raises:
-        ValueError: no steps, looks or beams, or a place of the detector that is none.
-        TypeError: a place that is no tuple of numbers.
+        ValueError: no steps or beams, or a start that is no state of the plant.
     """
 
     name: str
     steps: int
-    command: Callable[[jax.Array, jax.Array], jax.Array]  # (step, true pose) -> (v, omega) to drive
-    start: tuple[float, float, float]  # m, m, rad: mean of the prior
-    prior_std: tuple[float, float, float] = (0.05**0.5, 0.05**0.5, 0.02**0.5)  # m, m, rad
-    dt: float = 0.1  # s
-    sight_range: float = 7.5  # m: the detector reports landmarks nearer than this
-    sight_period: int = 5  # steps between two looks of the detector, the first at step 0
+    command: Callable[[jax.Array, jax.Array], jax.Array]  # (step, true pose) -> control to drive
+    start: tuple[float, ...]  # m, m, rad, ...: mean of the prior
+    prior_std: tuple[float, ...] = (0.05**0.5, 0.05**0.5, 0.02**0.5)  # m, m, rad, ...
+    exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
+    # What filter and robot have in common: the period, the sensor, where sensor and scanner sit, the scanner's ranges.
+    robot: Config = Config(grid=_COURSE_GRID)  # noqa: RUF009 (frozen)
+    plant: MotionModel | None = None  # how the state moves under its noise; None: as the course's robot (`drive`)
+    detector: Detector = Detector()
     beams: int = 61
     half_view: float = 1.2  # rad: beams from -half_view to half_view
-    max_range: float = 8.0  # m
-    min_range: float = 0.05  # m
-    grid: GridSpec = _COURSE_GRID
-    outliers: bool = False  # some sightings are false: at any range within reach, in any direction
-    exact_prior: bool = True  # the true start is the prior's mean; otherwise it is drawn from the prior
-    sensor_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m, m, rad: landmark detector in the body frame
 
     def __post_init__(self) -> None:
-        freeze_tuples(self, "sensor_offset")
-        check_offset(self.sensor_offset)
-        for name in ("steps", "sight_period", "beams"):
+        for name in ("steps", "beams"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Scenario.{name}: expected at least 1, got {getattr(self, name)}")
+        least = POSE if self.plant is None else self.plant.dim
+        if not len(self.start) == len(self.prior_std) >= least:
+            got = f"{len(self.start)} and {len(self.prior_std)} entries"
+            raise ValueError(f"Scenario.start, prior_std: expected the {least} of the plant's state or more, got {got}")
 
-    def looks(self, k: jax.Array) -> jax.Array:
-        """Whether the detector looks at step k."""
-        return k % self.sight_period == 0
+    @property
+    def dt(self) -> float:
+        """The period of a step, s."""
+        return self.robot.dt
+
+    @property
+    def dim(self) -> int:
+        """Entries of the true state."""
+        return POSE if self.plant is None else self.plant.dim
 
     def prior(self) -> Gaussian:
         """The belief at step -1, in the default float type."""
         return Gaussian(jnp.array(self.start), jnp.diag(jnp.array(self.prior_std) ** 2))
 
     def beam_angles(self) -> jax.Array:
-        """(B,) rad, body frame."""
+        """(B,) rad, in the scanner's frame."""
         return jnp.asarray(np.linspace(-self.half_view, self.half_view, self.beams), jnp.result_type(float))
 
     def config(self, *, motion: Any = "arc", gate_probability: float | None = 0.99, grid: bool = True) -> Config:
         """The filter's settings that fit this robot."""
-        return Config(
-            dt=self.dt,
-            motion=motion,
-            gate_probability=gate_probability,
-            sensor_offset=self.sensor_offset,
-            grid=self.grid if grid else None,
-            min_range=self.min_range,
-            max_range=self.max_range,
-        )
+        spec = self.robot.grid if grid else None
+        return dataclasses.replace(self.robot, motion=motion, gate_probability=gate_probability, grid=spec)
+
+    def check(self, config: Config) -> None:
+        """Raise unless these are settings of a filter on this robot.
+
+        Raises:
+            ValueError: a setting that both have in common is another one.
+        """
+        for name in ("dt", "sensor", "sensor_offset", "scanner_offset", "min_range", "max_range"):
+            ours, theirs = getattr(self.robot, name), getattr(config, name)
+            if theirs != ours:
+                raise ValueError(f"config.{name}: expected that of the scenario, {ours}, got {theirs}")
 
 
 def course_params() -> Params:
@@ -93,12 +150,23 @@ def course_params() -> Params:
     return Params.from_std(v=0.02, w=0.03, range=0.15, bearing=0.03)
 
 
-def own_params(noise: Noise, dt: float) -> Params:
-    """The robot's own noise, for a filter with `euler` motion, which is the plant's model: the heading noise of a step
-    is what a yaw rate's would be that acts for its length.
+def own_params(noise: Noise, scenario: Scenario) -> Params:
+    """The robot's own noise, for a filter whose motion model is `own_motion`.
+
+    The heading noise that the course's plant adds to a step is what a yaw rate's would be that acts for its length.
     """
-    w = (float(noise.w) ** 2 + (float(noise.heading) / dt) ** 2) ** 0.5
-    return Params.from_std(v=float(noise.v), w=w, range=float(noise.range), bearing=float(noise.bearing))
+    blocks = {}
+    for block in (*own_motion(scenario).noise, sensors.resolve(scenario.robot.sensor).noise):
+        std = [float(x) for x in noise.std(block)]
+        if scenario.plant is None and block == Q:
+            std[1] = math.hypot(std[1], float(noise.heading) / scenario.dt)
+        blocks |= {block.name: std} if block not in (Q, R) else dict(zip(block.components, std, strict=True))
+    return Params.from_std(**blocks)
+
+
+def own_motion(scenario: Scenario) -> MotionModel:
+    """The plant's motion model: that of the course is `euler`."""
+    return motion.EULER if scenario.plant is None else scenario.plant
 
 
 def _capstone_command(k: jax.Array, pose: jax.Array) -> jax.Array:

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap._internal.batching import zero_like_any
+from jaxlocmap._internal.batching import scan
 from jaxlocmap._internal.trig import sin_cos
+from jaxlocmap.se2 import POSE
 from jaxlocmap.types import GridSpec
 
 
@@ -61,7 +62,7 @@ def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_r
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(pose=(pose, (3,)), beam_angles=(beam_angles, (None,)), segments=(segments, (None, 2, 2)))
+    checks.shapes(pose=(pose, (POSE,)), beam_angles=(beam_angles, (None,)), segments=(segments, (None, 2, 2)))
     checks.shape("max_range", max_range, ())
     sin, cos = sin_cos(pose[2])
     table_cos, table_sin = jnp.cos(beam_angles), jnp.sin(beam_angles)
@@ -79,9 +80,7 @@ def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_r
         return jnp.where(hits, jnp.minimum(nearest, t), nearest), None
 
     # Beams side by side, wall after wall: a minimum over a short last axis would not be vector code.
-    zero = zero_like_any(pose, beam_angles, segments)
-    far = jnp.full(dx.shape, max_range, dx.dtype) + zero.astype(dx.dtype)
-    return jax.lax.scan(nearer, far, segments, unroll=8)[0]
+    return scan(nearer, jnp.full(dx.shape, max_range, dx.dtype), segments, unroll=8)[0]
 
 
 def occupancy(world: World, spec: GridSpec) -> jax.Array:
@@ -115,5 +114,4 @@ def occupancy(world: World, spec: GridSpec) -> jax.Array:
             leave = jnp.minimum(leave, jnp.where(across, last, jnp.where(between, 1, -jnp.inf)))
         return occupied | (enter <= leave), None
 
-    nothing = jnp.full(spec.shape, zero_like_any(world.segments) != 0)
-    return jax.lax.scan(with_wall, nothing, world.segments)[0]
+    return scan(with_wall, jnp.zeros(spec.shape, bool), world.segments)[0]

@@ -17,7 +17,7 @@ from jaxlocmap.types import Gaussian, Inputs
 class Batch(NamedTuple):
     """N sequences of T steps. What is counted is judged; the filter goes through all of it."""
 
-    prior: Gaussian  # (N, 3), (N, 3, 3): the belief before the first step
+    prior: Gaussian  # (N, n), (N, n, n): the belief before the first step
     inputs: Inputs  # leading axes N, T
     counted: jax.Array  # (N, T) bool: not the padding, and not the steps in which a window runs in
     landmarks: jax.Array | None = None  # (L, 2) m
@@ -61,7 +61,7 @@ def sequence(
 
 
 def no_observations(steps: int) -> Inputs:
-    """Inputs (T,) of a robot that stands still and sees nothing, to fill in what it did measure; no slots."""
+    """Inputs (T,) of a robot that stands still and observes nothing, to fill in what it did measure; no slots."""
     arrays: Any = (
         np.zeros(steps),
         np.zeros((steps, 2)),
@@ -197,7 +197,7 @@ def _drives(
 ) -> tuple[Any, Inputs]:
     def one(key: jax.Array, world: World) -> tuple[Any, Inputs]:
         start_key, key = jax.random.split(key)
-        start = prior.mean if scenario.exact_prior else simulation.draw_pose(start_key, prior)
+        start = (prior.mean if scenario.exact_prior else simulation.draw_state(start_key, prior))[: scenario.dim]
         return simulation.simulate(key, world, noise, start, scenario=scenario, scan=scans)
 
     return jax.vmap(one, in_axes=(0, 0 if worlds else None))(keys, world)

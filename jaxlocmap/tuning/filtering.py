@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxlocmap import checks
+from jaxlocmap import checks, motion
 from jaxlocmap.pipeline import init, run
+from jaxlocmap.se2 import POSE
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params
 
@@ -20,7 +21,7 @@ class Judged(NamedTuple):
     """What is known of a step beside what the filter reports."""
 
     counted: jax.Array  # () bool
-    truth: jax.Array | None  # (3,) m, m, rad
+    truth: jax.Array | None  # (3,) m, m, rad, of the pose
     known: jax.Array | None  # () bool
 
 
@@ -28,7 +29,9 @@ def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[
     """The filter over every sequence, without mapping.
 
     Args:
-        params: the filter's. batch: N sequences of T steps. config: static; its grid is left aside.
+        params: the filter's.
+        batch: N sequences of T steps; of a longer prior the filter takes the first entries.
+        config: static; its grid is left aside.
         collect: `(info, judged) -> pytree`, what to keep of each step.
 
     Returns:
@@ -39,11 +42,11 @@ def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[
     """
     check_batch(batch)
     config = dataclasses.replace(config, grid=None)
-    dtype = jnp.asarray(batch.prior.mean).dtype
+    dtype, dim = jnp.asarray(batch.prior.mean).dtype, motion.resolve(config.motion).dim
     params, landmarks, truth = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, batch.landmarks, batch.truth))
 
     def one(prior: Gaussian, inputs: Inputs, judged: Judged) -> Any:
-        state = init(prior, config=config)
+        state = init(prior.first(dim), config=config)
         _, collected = run(
             params,
             state,
@@ -60,7 +63,7 @@ def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[
 
 
 def beliefs(params: Params, batch: Batch, *, config: Config) -> Gaussian:
-    """The filter's belief after every step, (N, T, 3) m, m, rad and (N, T, 3, 3). The rest as of `filtered`."""
+    """The filter's belief after every step, (N, T, n) and (N, T, n, n). The rest as of `filtered`."""
     return filtered(params, batch, config=config, collect=lambda info, _: info.belief)
 
 
@@ -73,10 +76,11 @@ def check_batch(batch: Batch) -> None:
     """
     checks.shape("batch.counted", batch.counted, (None, None))
     n, steps = np.shape(batch.counted)
-    checks.shape("batch.prior.mean", batch.prior.mean, (n, 3))
-    checks.shape("batch.prior.cov", batch.prior.cov, (n, 3, 3))
+    checks.shape("batch.prior.mean", batch.prior.mean, (n, None))
+    dim = np.shape(batch.prior.mean)[1]
+    checks.shape("batch.prior.cov", batch.prior.cov, (n, dim, dim))
     checks.shape("batch.inputs.dt", batch.inputs.dt, (n, steps))
-    for name, shape in (("truth", (n, steps, 3)), ("known", (n, steps)), ("poses", (n, steps, 3))):
+    for name, shape in (("truth", (n, steps, POSE)), ("known", (n, steps)), ("poses", (n, steps, POSE))):
         if getattr(batch, name) is not None:
             checks.shape(f"batch.{name}", getattr(batch, name), shape)
     places = {"prior.mean": batch.prior.mean, "truth": batch.truth, "poses": batch.poses, "landmarks": batch.landmarks}

@@ -16,7 +16,7 @@ import optax
 from jaxlocmap.tuning.batch import Batch, pick
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.losses import Objective
-from jaxlocmap.tuning.parameters import NOISE, Coordinates, constrain, natural, unconstrain
+from jaxlocmap.tuning.parameters import NOISE, Coordinates, constrain, correlations_of, natural, unconstrain
 from jaxlocmap.types import Params
 
 
@@ -57,22 +57,24 @@ def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str
         tuned = constrain(unconstrain(params) | unravel(found.x))
 
     Raises:
-        ValueError: nothing to tune, a name that is none of `NAMES`, more than the losses tell
+        ValueError: nothing to tune, a name that is none of the filter's parameters, more than the losses tell
             (`Objective.check_tuned`), or parameters beyond the limits of `constrain`.
     """
     objective.check_tuned(tuned)
     params.check()
-    inside = natural(constrain(unconstrain(params)))
-    for name, value in natural(params).items():
-        if not np.allclose(value, inside[name], rtol=1e-3, atol=1e-3 if name in ("v_w", "range_bearing") else 0):
+    blocks = objective.blocks
+    whole = unconstrain(params, blocks)
+    inside = natural(constrain(whole, blocks), blocks)
+    for name, value in natural(params, blocks).items():
+        if not np.allclose(value, inside[name], rtol=1e-3, atol=1e-3 if name in correlations_of(blocks) else 0):
             raise ValueError(
                 f"{name}: expected a value within the limits of tuning, the nearest being {float(inside[name]):.3g}, "
                 f"got {float(value):.3g}"
             )
-    fixed = {name: value for name, value in unconstrain(params).items() if name not in tuned}
+    fixed = {name: value for name, value in whole.items() if name not in tuned}
 
     def at(coordinates: Coordinates, batch: Batch) -> Any:
-        return objective(constrain(fixed | coordinates), batch)
+        return objective(constrain(fixed | coordinates, blocks, others=params), batch)
 
     return forward(at)
 
@@ -97,7 +99,7 @@ def fit(
 
     Args:
         objective: what for. params: the start; what is not tuned stays. batch: to tune on.
-        tuned: which of `parameters.NAMES`.
+        tuned: which parameters, `parameters.names_of(objective.blocks)` being all.
         optimiser: L-BFGS by default, which wants the whole batch at every step; with minibatches
             `optax.adam(0.05)`: coordinates are logarithms, so that is 5 % a step.
         epochs: at most so many; after each the validation loss is taken and `progress` called.
@@ -128,7 +130,12 @@ def fit(
         optimiser = _lbfgs() if minibatch is None else optax.adam(0.05)
     optimiser = optax.with_extra_args_support(optimiser)
     dtype = jnp.asarray(batch.prior.mean).dtype
-    whole = {name: jnp.asarray(value, dtype) for name, value in unconstrain(params).items()}
+    blocks = objective.blocks
+    whole = {name: jnp.asarray(value, dtype) for name, value in unconstrain(params, blocks).items()}
+
+    def params_at(theta: Coordinates) -> Params:
+        return constrain(whole | theta, blocks, others=params)
+
     theta = {name: whole[name] for name in tuned}
     judge = validation if validation is not None else batch
 
@@ -152,14 +159,14 @@ def fit(
         fine = jnp.isfinite(loss) & jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(moved))
         kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), (moved, after), (theta, state))
         evaluations = fresh.astype(jnp.int32) + _line_search_steps(after)
-        return kept, Trace(loss, norm, ~fine, evaluations, natural(constrain(whole | theta)))
+        return kept, Trace(loss, norm, ~fine, evaluations, natural(params_at(theta), blocks))
 
     @jax.jit
     def epoch(carry: Any, keys: Any, batch: Batch) -> Any:
         return jax.lax.scan(functools.partial(step, batch), carry, keys)
 
     def judged(theta: Coordinates) -> float:
-        return objective.judged(constrain(whole | theta), judge)[0]
+        return objective.judged(params_at(theta), judge)[0]
 
     keys = jax.random.split(key, (epochs, steps)) if key is not None else np.zeros((epochs, steps))
     carry = _strong((theta, optimiser.init(theta)))
@@ -175,7 +182,7 @@ def fit(
     def so_far() -> Fit:
         trace = jax.tree.map(lambda *xs: np.concatenate(xs), *traces)
         seconds = compiled - began, time.perf_counter() - compiled
-        return Fit(constrain(whole | best), best_loss, np.array(losses), trace, best_epoch, stale >= patience, *seconds)
+        return Fit(params_at(best), best_loss, np.array(losses), trace, best_epoch, stale >= patience, *seconds)
 
     for number in range(epochs):
         carry, trace = program(carry, keys[number], batch)

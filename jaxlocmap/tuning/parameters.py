@@ -7,61 +7,98 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap import checks
-from jaxlocmap.types import Params
+from jaxlocmap import checks, motion, sensors
+from jaxlocmap import parameters as blocks_of_params
+from jaxlocmap.parameters import Block, Params
+from jaxlocmap.types import Config
 
 Coordinates = dict[str, jax.Array]
 """Each parameter by name, () and free to take any value."""
 
-NAMES = ("v", "w", "v_w", "range", "bearing", "range_bearing", "l_occ", "l_free")
-NOISE = ("v", "w", "range", "bearing")  # with Q and R diagonal
-FULL_NOISE = ("v", "w", "v_w", "range", "bearing", "range_bearing")
-CORRELATIONS = ("v_w", "range_bearing")
-SENSOR_MODEL = ("l_occ", "l_free")
-UNITS: dict[str, str] = dict(zip(NAMES, ("m/s", "rad/s", "–", "m", "rad", "–", "nats", "nats"), strict=True))
+BLOCKS = (blocks_of_params.Q, blocks_of_params.R, *blocks_of_params.SENSOR_MODEL)
+
+
+def blocks_of(config: Config) -> tuple[Block, ...]:
+    """The blocks that a filter with these settings has: of its motion model, its sensor and its map."""
+    own = (*motion.resolve(config.motion).noise, sensors.resolve(config.sensor).noise)
+    return (*own, *blocks_of_params.SENSOR_MODEL)
+
+
+def names_of(blocks: tuple[Block, ...]) -> tuple[str, ...]:
+    """The parameters of blocks: of a covariance its standard deviations by component, then the correlations "a_b"."""
+    return tuple(name for block in blocks for name in (*block.components, *_correlations(block)))
+
+
+def correlations_of(blocks: tuple[Block, ...]) -> tuple[str, ...]:
+    """The parameters that are correlations."""
+    return tuple(name for block in blocks for name in _correlations(block))
+
+
+def units_of(blocks: tuple[Block, ...]) -> dict[str, str]:
+    """The unit of each parameter; a correlation has none."""
+    return {name: unit for block in blocks for name, unit in zip(block.components, block.units, strict=True)} | (
+        dict.fromkeys(correlations_of(blocks), "–")
+    )
+
+
+NAMES = names_of(BLOCKS)
+CORRELATIONS = correlations_of(BLOCKS)
+UNITS = {name: units_of(BLOCKS)[name] for name in NAMES}
+SENSOR_MODEL = names_of(blocks_of_params.SENSOR_MODEL)
+FULL_NOISE = tuple(name for name in NAMES if name not in SENSOR_MODEL)
+NOISE = tuple(name for name in FULL_NOISE if name not in CORRELATIONS)  # with Q and R diagonal
 
 _DEVIATION = math.log(1e5)  # standard deviations and log-odds lie between 1e-5 and 1e5 of their units,
 _TILT = 10.0  # and correlations within ±0.995: beyond, float32 cannot hold the matrix apart from a singular one
 
 
-def check_names(tuned: tuple[str, ...]) -> None:
-    """Raise unless these are some of `NAMES`.
+def check_names(tuned: tuple[str, ...], blocks: tuple[Block, ...] = BLOCKS) -> None:
+    """Raise unless these are parameters of the blocks.
 
     Raises:
         ValueError: none, or another name.
     """
-    if not tuned or any(name not in NAMES for name in tuned):
-        raise ValueError(f"tuned: expected some of {NAMES}, got {tuned}")
+    names = names_of(blocks)
+    if not tuned or any(name not in names for name in tuned):
+        raise ValueError(f"tuned: expected some of {names}, got {tuned}")
 
 
-def unconstrain(params: Params) -> Coordinates:
-    """The coordinates of parameters, all eight of `NAMES`. `constrain` is the way back.
+def unconstrain(params: Params, blocks: tuple[Block, ...] = BLOCKS) -> Coordinates:
+    """The coordinates of parameters, one for each of `names_of(blocks)`. `constrain` is the way back.
 
-        Q = L Lᵀ,  L = [[exp(v), 0], [exp(w) v_w, exp(w)]],   R likewise,   l_occ = exp(.),  l_free = -exp(.)
+        covariance = L Lᵀ,  L_ii = exp(a_i),  L_ij = L_ii a_ij below the diagonal
+        positive = exp(a),  negative = -exp(a),  real = a
 
-    Source: Pinheiro & Bates 1996, the log-Cholesky parametrisation; the entry off the diagonal is in units of its
+    Source: Pinheiro & Bates 1996, the log-Cholesky parametrisation; the entries off the diagonal are in units of their
     row's diagonal.
 
     Raises:
-        ValueError: a wrong shape; a batch of parameters is a `vmap`.
+        ValueError: a wrong shape (a batch of parameters is a `vmap`), or a block that is not there.
     """
-    _check_shapes(params)
-    return {
-        **_log_cholesky(params.Q, "v", "w"),
-        **_log_cholesky(params.R, "range", "bearing"),
-        "l_occ": jnp.log(params.l_occ),
-        "l_free": jnp.log(-params.l_free),
-    }
+    coordinates: Coordinates = {}
+    for block in blocks:
+        value = params.block(block)
+        if block.kind == "covariance":
+            L = _cholesky(value)
+            diagonal = [jnp.log(L[i][i]) for i in range(len(L))]
+            below = [L[i][j] / L[i][i] for i in range(len(L)) for j in range(i)]
+            coordinates |= dict(zip(names_of((block,)), [*diagonal, *below], strict=True))
+        else:
+            sign = -1 if block.kind == "negative" else 1
+            coordinates[block.name] = value if block.kind == "real" else jnp.log(sign * value)
+    return coordinates
 
 
-def constrain(coordinates: Coordinates) -> Params:
-    """The parameters at coordinates: whatever these are, Q and R are positive definite and l_occ > 0 > l_free.
+def constrain(coordinates: Coordinates, blocks: tuple[Block, ...] = BLOCKS, *, others: Params | None = None) -> Params:
+    """The parameters at coordinates: whatever these are, covariances are positive definite and signs are right.
 
-    Far out the coordinates have limits (1e-5 to 1e5 in the units of each; correlations to ±0.995), at which the
+    Far out the coordinates have limits (1e-5 to 1e5 in the units of each; correlations of two to ±0.995), at which the
     derivative is zero.
 
     Args:
-        coordinates: all eight of `NAMES`, () each.
+        coordinates: all of `names_of(blocks)`, () each.
+        blocks: static.
+        others: what the blocks leave out, such as the gate's probability; none by default.
 
     Returns:
         `Params` that `Params.check` accepts.
@@ -70,49 +107,61 @@ def constrain(coordinates: Coordinates) -> Params:
         ValueError: a wrong shape; a batch of coordinates is a `vmap`.
     """
     checks.shapes(**{name: (value, ()) for name, value in coordinates.items()})
-    return Params(
-        Q=_covariance(coordinates, "v", "w"),
-        R=_covariance(coordinates, "range", "bearing"),
-        l_occ=_positive(coordinates["l_occ"]),
-        l_free=-_positive(coordinates["l_free"]),
-    )
+    nothing = jnp.zeros(())
+    params = Params(None, None, nothing, nothing) if others is None else others
+    for block in blocks:
+        if block.kind == "covariance":
+            value = _covariance(coordinates, block)
+        elif block.kind == "real":
+            value = coordinates[block.name]
+        else:
+            value = (-1 if block.kind == "negative" else 1) * _positive(coordinates[block.name])
+        params = params.with_block(block, value)
+    return params
 
 
-def natural(params: Params) -> dict[str, jax.Array]:
+def natural(params: Params, blocks: tuple[Block, ...] = BLOCKS) -> dict[str, jax.Array]:
     """What people call the parameters, by the same names: standard deviations, correlations, log-odds.
 
     Raises:
-        ValueError: a wrong shape; a batch of parameters is a `vmap`.
+        ValueError: as `unconstrain`.
     """
-    _check_shapes(params)
-    return {
-        **_deviations(params.Q, "v", "w"),
-        **_deviations(params.R, "range", "bearing"),
-        "l_occ": params.l_occ,
-        "l_free": params.l_free,
-    }
+    values: dict[str, jax.Array] = {}
+    for block in blocks:
+        value = params.block(block)
+        if block.kind == "covariance":
+            std = [jnp.sqrt(value[i, i]) for i in range(len(value))]
+            below = [value[j, i] / (std[j] * std[i]) for i in range(len(value)) for j in range(i)]
+            values |= dict(zip(names_of((block,)), [*std, *below], strict=True))
+        else:
+            values[block.name] = value
+    return values
 
 
-def _check_shapes(params: Params) -> None:
-    checks.shapes(Q=(params.Q, (2, 2)), R=(params.R, (2, 2)), l_occ=(params.l_occ, ()), l_free=(params.l_free, ()))
+def _correlations(block: Block) -> tuple[str, ...]:
+    return block.correlations if block.kind == "covariance" else ()
 
 
-def _log_cholesky(cov: jax.Array, first: str, second: str) -> Coordinates:
-    across = cov[0, 1] / jnp.sqrt(cov[0, 0])
-    rest = jnp.sqrt(cov[1, 1] - across**2)
-    return {first: 0.5 * jnp.log(cov[0, 0]), second: jnp.log(rest), f"{first}_{second}": across / rest}
+def _cholesky(cov: jax.Array) -> list[list[jax.Array]]:
+    """The lower triangle of a covariance's Cholesky factor, reading its upper triangle."""
+    L: list[list[jax.Array]] = []
+    for i in range(len(cov)):
+        row: list[jax.Array] = []
+        for j in range(i):
+            row.append((cov[j, i] - sum(row[k] * L[j][k] for k in range(j))) / L[j][j])
+        row.append(jnp.sqrt(cov[i, i] - sum(x * x for x in row)))
+        L.append(row)
+    return L
 
 
-def _covariance(coordinates: Coordinates, first: str, second: str) -> jax.Array:
-    a, b = _positive(coordinates[first]), _positive(coordinates[second])
-    tilt = jnp.clip(coordinates[f"{first}_{second}"], -_TILT, _TILT)
-    across = a * b * tilt
-    return jnp.stack([jnp.stack([a * a, across]), jnp.stack([across, b * b * (1 + tilt * tilt)])])
-
-
-def _deviations(cov: jax.Array, first: str, second: str) -> dict[str, jax.Array]:
-    a, b = jnp.sqrt(cov[0, 0]), jnp.sqrt(cov[1, 1])
-    return {first: a, second: b, f"{first}_{second}": cov[0, 1] / (a * b)}
+def _covariance(coordinates: Coordinates, block: Block) -> jax.Array:
+    m, tilts = len(block.components), iter(block.correlations)
+    L = []
+    for i in range(m):
+        size = _positive(coordinates[block.components[i]])
+        L.append([*(size * jnp.clip(coordinates[next(tilts)], -_TILT, _TILT) for _ in range(i)), size])
+    rows = [[sum(L[i][k] * L[j][k] for k in range(min(i, j) + 1)) for j in range(m)] for i in range(m)]
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def _positive(x: jax.Array) -> jax.Array:

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
+from jaxlocmap.parameters import Block
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.tuning.losses import Objective
-from jaxlocmap.tuning.parameters import CORRELATIONS, constrain, natural, unconstrain
+from jaxlocmap.tuning.parameters import BLOCKS, constrain, correlations_of, natural, unconstrain
 from jaxlocmap.types import Params
 
 _VAGUE = 1.0  # a standard error of a coordinate above this is said in words
@@ -21,7 +22,7 @@ _PART = 0.1  # of a direction's unit length: a parameter that has a part in it
 _FEW = 20  # sequences: from fewer, standard errors come out too small
 
 
-class Certainty(NamedTuple):
+class StandardErrors(NamedTuple):
     """Of the tuned parameters, in the order of `names`. NumPy float64."""
 
     names: tuple[str, ...]
@@ -33,7 +34,7 @@ class Certainty(NamedTuple):
     words: tuple[str, ...]  # what the data cannot tell
 
 
-def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[str, ...]) -> Certainty:
+def standard_errors(objective: Objective, params: Params, batch: Batch, tuned: tuple[str, ...]) -> StandardErrors:
     """How far the parameters that minimise an objective would move with other data of the same kind.
 
         cov = H⁻¹ (Σ_n g_n g_nᵀ) H⁻¹ N / (N - 1)
@@ -50,7 +51,7 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
 
     Args:
         params: where the objective is at its minimum; where it is not, the words say so. batch: of at least two
-            sequences, what it was tuned on. tuned: which of `parameters.NAMES`.
+            sequences, what it was tuned on. tuned: which parameters.
 
     Raises:
         ValueError: fewer than two sequences, nothing to tune, or more than the losses tell (`Objective.check_tuned`).
@@ -61,11 +62,12 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
     if n < 2:
         raise ValueError(f"batch: expected at least two sequences to compare, got {n}; cut long ones into windows")
     objective.check_tuned(tuned)
-    whole = unconstrain(params)
+    blocks = objective.blocks
+    whole = unconstrain(params, blocks)
     theta = jnp.stack([whole[name] for name in tuned]).astype(jnp.asarray(batch.prior.mean).dtype)
 
     def at(theta: jax.Array) -> Params:
-        return constrain(whole | dict(zip(tuned, theta, strict=True)))
+        return constrain(whole | dict(zip(tuned, theta, strict=True)), blocks, others=params)
 
     @jax.jit
     def derivatives(theta: jax.Array, batch: Batch) -> tuple[jax.Array, ...]:
@@ -88,12 +90,12 @@ def certainty(objective: Objective, params: Params, batch: Batch, tuned: tuple[s
         hessian = jnp.einsum("k,kij->ij", weight, second_of_sum)
         hessian = hessian + jnp.einsum("kl,ki,lj->ij", bend, slope_of_sum, slope_of_sum)
         influence = jnp.einsum("k,nki->ni", weight, slope) + jnp.einsum("kl,nl,ki->ni", bend, each, slope_of_sum)
-        scale = jax.jacfwd(lambda x: jnp.stack([natural(at(x))[name] for name in tuned]))(theta)
+        scale = jax.jacfwd(lambda x: jnp.stack([natural(at(x), blocks)[name] for name in tuned]))(theta)
         return jnp.einsum("k,ki->i", weight, slope_of_sum), hessian, influence, scale
 
     gradient, hessian, influence, scale = (np.asarray(x, np.float64) for x in derivatives(theta, batch))
-    estimate = np.array([float(natural(params)[name]) for name in tuned])
-    return _judge(tuned, estimate, gradient, 0.5 * (hessian + hessian.T), influence, scale)
+    estimate = np.array([float(natural(params, blocks)[name]) for name in tuned])
+    return _judge(tuned, estimate, gradient, 0.5 * (hessian + hessian.T), influence, scale, blocks)
 
 
 def _judge(
@@ -103,7 +105,8 @@ def _judge(
     hessian: np.ndarray,
     influence: np.ndarray,
     scale: np.ndarray,
-) -> Certainty:
+    blocks: tuple[Block, ...] = BLOCKS,
+) -> StandardErrors:
     n = len(influence)
     meat = influence.T @ influence * n / (n - 1)
     curvature, axes = np.linalg.eigh(hessian)
@@ -141,16 +144,23 @@ def _judge(
         vague = 100 / np.sqrt(2 * (n - 1))
         words.append(f"{n} sequences are few: standard errors are known to some {vague:.0f} %, and come out too small")
     error = np.where(lost, np.inf, error)
-    return Certainty(names, estimate, error, _interval(names, estimate, error, n), correlation, hessian, tuple(words))
+    return StandardErrors(
+        names, estimate, error, _interval(names, estimate, error, n, blocks), correlation, hessian, tuple(words)
+    )
 
 
-def _interval(names: tuple[str, ...], estimate: np.ndarray, error: np.ndarray, n: int) -> np.ndarray:
+def _interval(
+    names: tuple[str, ...], estimate: np.ndarray, error: np.ndarray, n: int, blocks: tuple[Block, ...]
+) -> np.ndarray:
     """What holds the value in 95 of 100 tunings, (P, 2), from n sequences."""
     reach = scipy.special.stdtrit(n - 1, 0.975) * error
-    ends = []
+    ends, correlations = [], correlations_of(blocks)
+    real = [block.name for block in blocks if block.kind == "real"]
     for name, value, far in zip(names, estimate, reach, strict=True):
-        if name in CORRELATIONS:
+        if name in correlations:
             ends.append((max(value - far, -1.0), min(value + far, 1.0)))
+        elif name in real:
+            ends.append((value - far, value + far))
         else:
             factor = np.exp(far / abs(value))
             ends.append(sorted((value / factor, value * factor)))
