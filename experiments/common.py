@@ -26,7 +26,7 @@ from rich.table import Table
 
 from jaxlocmap import Params, files, simulation
 from jaxlocmap.monte_carlo import Result, hosts, monte_carlo
-from jaxlocmap.monte_carlo.checkpoint import Parts
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint
 
 _README = Path(__file__).parent.parent / "README.md"
 # A path or a name may hold what looks like markup.
@@ -91,9 +91,9 @@ def start(config: ComputeConfig) -> None:
         CONSOLE.print("if one of them dies, JAX aborts all with a C++ stack: what they finished is kept, see --resume")
 
 
-def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -> Parts:
+def study_checkpoint(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -> Checkpoint:
     """Where in the output folder a study with these settings keeps its finished parts."""
-    return Parts(
+    return Checkpoint(
         out,
         settings,
         resume=config.resume,
@@ -102,7 +102,7 @@ def study_parts(out: Path, config: ComputeConfig, settings: Mapping[str, Any]) -
     )
 
 
-def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeConfig, parts: Parts) -> Result:
+def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeConfig, checkpoint: Checkpoint) -> Result:
     """`monte_carlo` under a bar. Ctrl-C stops it after the turn under way, a second Ctrl-C at once.
 
     Raises:
@@ -112,13 +112,13 @@ def study(one_run: Any, key: jax.Array, runs: int, *args: Any, config: ComputeCo
         with progress_bar("simulating", runs) as bar, _stopped_by_ctrl_c(bar) as progress:
             devices = jax.local_devices()[: config.devices]
             return monte_carlo(
-                one_run, key, runs, *args, chunk=config.chunk, devices=devices, progress=progress, parts=parts
+                one_run, key, runs, *args, chunk=config.chunk, devices=devices, progress=progress, checkpoint=checkpoint
             )
     except KeyboardInterrupt:
-        if not parts.runs_kept:
+        if not checkpoint.runs_kept:
             raise
         again = shlex.join([*sys.orig_argv, *([] if "--resume" in sys.argv else ["--resume"])])
-        kept = f"{parts.runs_kept:,} of {runs:,} runs are kept in {parts.folder}"
+        kept = f"{checkpoint.runs_kept:,} of {runs:,} runs are kept in {checkpoint.folder}"
         raise KeyboardInterrupt(f"{kept}; go on with\n{again}") from None
 
 
@@ -139,9 +139,9 @@ def how_computed(result: Result, runs: int, began: float, per_run: int = 1) -> d
     }
 
 
-def finish(parts: Parts) -> None:
+def finish(checkpoint: Checkpoint) -> None:
     """Clear the parts of a study whose report is written, by whichever process."""
-    hosts.in_turn(parts.clear)  # process 0 first, which has written the report by then
+    hosts.in_turn(checkpoint.clear)  # process 0 first, which has written the report by then
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from common import (
     show,
     start,
     study,
-    study_parts,
+    study_checkpoint,
     write_report,
 )
 from report_table import band, innovation_rows, pose_rows, print_verdicts
@@ -81,12 +81,12 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     world, noise, prior = simulation.room(), simulation.Noise(), scenario.prior()
     key = jax.random.key(config.seed)
     named = {name: getattr(config, name) for name in ("scenario", "motion", "gate", "start", "map", "seed")}
-    parts = study_parts(out, config.compute, named)
+    checkpoint = study_checkpoint(out, config.compute, named)
     CONSOLE.print(f"{runs} runs of {scenario.name}, {scenario.steps} steps each")
 
     began = time.perf_counter()
     totals = study(
-        Study(scenario, settings), key, runs, params, world, noise, prior, config=config.compute, parts=parts
+        Study(scenario, settings), key, runs, params, world, noise, prior, config=config.compute, checkpoint=checkpoint
     )
     report = {
         "scenario": scenario.name,
@@ -106,7 +106,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
             files.append("map.png")
         _print(report)
         saved(out, *files)
-    finish(parts)
+    finish(checkpoint)
     return report
 
 

@@ -17,6 +17,7 @@ from common import CONSOLE, command_line, count_rows, output_folder, params_or, 
 
 from jaxlocmap import Config, GridSpec, Params, map_scans, plotting
 from jaxlocmap.logs import Log, read
+from jaxlocmap.mapping import quality
 from jaxlocmap.mapping.ros import FREE, OCCUPIED, save_map
 from jaxlocmap.simulation import course_params
 from jaxlocmap.step import map_spec

@@ -31,7 +31,7 @@ from common import (
     scenario_of,
     start,
     study,
-    study_parts,
+    study_checkpoint,
     write_report,
 )
 from rich.table import Table
@@ -194,13 +194,13 @@ def main(config: SweepConfig) -> dict[str, Any]:
     noise = simulation.Noise()
     params = params_or(config.params, simulation.own_params(noise, scenario))
     named = {name: getattr(config, name) for name in ("x", "y", "scenario", "motion", "gate", "seed")}
-    parts = study_parts(out, config.compute, named)
+    checkpoint = study_checkpoint(out, config.compute, named)
     CONSOLE.print(f"{len(x)} x {len(y)} cells, {runs} runs of {scenario.name} in each, {scenario.steps} steps")
 
     began = time.perf_counter()
     sweep = SweepStudy(Study(scenario, settings), config.x, config.y)
     arguments = (jnp.array(x), jnp.array(y), params, simulation.room(), noise, scenario.prior())
-    result = study(sweep, jax.random.key(config.seed), runs, *arguments, config=config.compute, parts=parts)
+    result = study(sweep, jax.random.key(config.seed), runs, *arguments, config=config.compute, checkpoint=checkpoint)
     cells = []
     for i, j in np.ndindex(len(y), len(x)):
         totals = jax.tree.map(lambda total, at=(i, j): total[at], result.value)
@@ -232,7 +232,7 @@ def main(config: SweepConfig) -> dict[str, Any]:
         plotting.sweep_figure(out / "sweep.png", report, labels, ticks)
         _print(report)
         saved(out, "report.json", "sweep.png")
-    finish(parts)
+    finish(checkpoint)
     return report
 
 

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from disks import full_disk
 
-from jaxlocmap.monte_carlo import checkpoint as parts_module
+from jaxlocmap.monte_carlo import checkpoint as checkpoint_module
 from jaxlocmap.monte_carlo import chunks, monte_carlo
-from jaxlocmap.monte_carlo.checkpoint import Parts, Split, manifest
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint
 from jaxlocmap.monte_carlo.lock import Lock
+from jaxlocmap.monte_carlo.plan import Plan, manifest
 
 STUDY = {"runs": 30, "chunk": 4, "seed": 1}  # 8 chunks, each a part, the last of 2 runs
 ARRAYS = (np.arange(5.0) / 3, np.array([True, False]), np.zeros((0, 2), np.int32))
@@ -30,15 +31,15 @@ def folder(tmp_path):
 
 
 def at(folder, *args, **kwargs):
-    """Parts that are kept in the folder."""
-    return Parts(folder.parent, *args, **kwargs)
+    """Checkpoint that are kept in the folder."""
+    return Checkpoint(folder.parent, *args, **kwargs)
 
 
 def opened(folder, study=STUDY, **kwargs):
     said = []
     parts = at(folder, say=said.append, **{"discard": not kwargs.get("resume")} | kwargs)
     try:
-        return parts, parts.open(study, range(Split(study["runs"], study["chunk"]).parts)), said
+        return parts, parts.open(study, range(Plan(study["runs"], study["chunk"]).parts)), said
     finally:
         parts.release()
 
@@ -52,7 +53,7 @@ def the_file(folder, part):
 
 @pytest.mark.parametrize(("runs", "chunk"), [(1, 1), (7, 3), (255, 1), (256, 1), (257, 1), (10_000, 7), (10**9, 512)])
 def test_parts_hold_every_chunk_once_and_are_alike(runs, chunk):
-    split = Split(runs, chunk)
+    split = Plan(runs, chunk)
     pieces = [split.chunks_of(part) for part in range(split.parts)]
     assert pieces[0].start == 0
     assert pieces[-1].stop == split.chunks
@@ -320,8 +321,8 @@ def test_a_full_disk_is_told_and_keeps_what_is_kept(folder):
 
 def test_files_are_forced_to_disk_but_not_more_than_once_a_second(folder, monkeypatch):
     forced, now = [], [100.0]
-    monkeypatch.setattr(parts_module.os, "fsync", forced.append)
-    monkeypatch.setattr(parts_module.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(checkpoint_module.os, "fsync", forced.append)
+    monkeypatch.setattr(checkpoint_module.time, "monotonic", lambda: now[0])
     parts, *_ = opened(folder)
     assert len(forced) == 2  # the manifest and its folder
     for part, later in enumerate((0.5, 0.4, 0.2, 0.1)):
@@ -340,7 +341,7 @@ def walk(key, scale):
 def made(function=walk, key=0, scale=2.0, runs=10):
     key = jax.random.key(key)
     program = jax.jit(function).trace(key, jnp.asarray(scale)).lower().as_text()
-    return manifest(Split(runs, 4), program, key, (jnp.asarray(scale),))
+    return manifest(Plan(runs, 4), program, key, (jnp.asarray(scale),))
 
 
 def differing(a, b):
@@ -372,16 +373,16 @@ def test_the_user_s_flags_and_what_is_wanted_are_in_the_manifest(monkeypatch):
     assert made()["xla_flags"] == "--xla_mine=1"
     assert differing(plain, made()) == {"xla_flags"}
     assert (plain["runs"], plain["chunk"], plain["precision"]) == (10, 4, str(jnp.zeros(()).dtype))
-    one, other = (manifest(Split(1, 1), "", jax.random.key(0), pair) for pair in (((1.0, 2.0)), (2.0, 1.0)))
+    one, other = (manifest(Plan(1, 1), "", jax.random.key(0), pair) for pair in (((1.0, 2.0)), (2.0, 1.0)))
     assert differing(one, other) == {"arguments"}
-    assert manifest(Split(1, 1), "", jax.random.key(0), (), keep_runs=True)["keep_runs"] is True
+    assert manifest(Plan(1, 1), "", jax.random.key(0), (), keep_runs=True)["keep_runs"] is True
 
 
 def test_a_study_of_sums_does_not_go_on_as_one_of_runs(folder):
-    stopped(20, chunk=4, parts=at(folder))
+    stopped(20, chunk=4, checkpoint=at(folder))
     told = r"^resume: expected the study .* got another: .*keep_runs was False, is True"
     with pytest.raises(ValueError, match=told):
-        monte_carlo(walk, KEY, 30, 2.0, parts=at(folder, resume=True), keep_runs=True)
+        monte_carlo(walk, KEY, 30, 2.0, checkpoint=at(folder, resume=True), keep_runs=True)
 
 
 @pytest.mark.slow
@@ -426,26 +427,26 @@ def test_a_stopped_study_goes_on_to_the_same_last_bit(folder, keep_runs):
     kwargs = {"keep_runs": keep_runs, "devices": jax.local_devices()[:1]}
     whole = monte_carlo(walk, KEY, 30, 2.0, chunk=4, **kwargs)
     assert whole.resumed_runs == 0
-    stopped(20, chunk=4, parts=at(folder), **kwargs)
+    stopped(20, chunk=4, checkpoint=at(folder), **kwargs)
     the_file(folder, 1).write_bytes(b"torn")
     done = []
     parts = at(folder, resume=True)
     # The chunk need not be said again.
-    result = monte_carlo(walk, KEY, 30, 2.0, parts=parts, progress=done.append, **kwargs)
+    result = monte_carlo(walk, KEY, 30, 2.0, checkpoint=parts, progress=done.append, **kwargs)
     np.testing.assert_array_equal(result.value, whole.value)
     assert (result.resumed_runs, result.chunk) == (16, 4)
     assert done == [20, 24, 28, 30]  # part 1, then the last three
     assert parts.runs_kept == 30
     # All is there now, so nothing is computed.
     parts = at(folder, resume=True)
-    result = monte_carlo(walk, KEY, 30, 2.0, parts=parts, progress=pytest.fail, **kwargs)
+    result = monte_carlo(walk, KEY, 30, 2.0, checkpoint=parts, progress=pytest.fail, **kwargs)
     np.testing.assert_array_equal(result.value, whole.value)
     assert result.resumed_runs == 30
 
 
 def test_parts_of_many_chunks_go_on_as_well(folder):
     def long(resume=False, **kwargs):
-        return monte_carlo(walk, KEY, 1000, 2.0, chunk=1, parts=at(folder, resume=resume), **kwargs)
+        return monte_carlo(walk, KEY, 1000, 2.0, chunk=1, checkpoint=at(folder, resume=resume), **kwargs)
 
     whole = monte_carlo(walk, KEY, 1000, 2.0, chunk=1)
 
@@ -462,18 +463,18 @@ def test_parts_of_many_chunks_go_on_as_well(folder):
 
 
 def test_a_wrong_folder_is_refused_before_anything_is_compiled_or_touched(folder):
-    stopped(20, chunk=4, parts=at(folder, {"motion": "arc"}))
+    stopped(20, chunk=4, checkpoint=at(folder, {"motion": "arc"}))
     compiles = chunks.compile.cache_info().misses
 
     def other(key, scale):
         return walk(key, scale) + 1
 
     with pytest.raises(ValueError, match=r"motion was 'arc', is 'euler'; .*program was '\w+', is '\w+'$"):
-        monte_carlo(other, KEY, 30, 2.0, chunk=4, parts=at(folder, {"motion": "euler"}, resume=True))
+        monte_carlo(other, KEY, 30, 2.0, chunk=4, checkpoint=at(folder, {"motion": "euler"}, resume=True))
     with pytest.raises(ValueError, match=r"another: chunk was 4, is 5$"):
-        monte_carlo(walk, KEY, 30, 2.0, chunk=5, parts=at(folder, {"motion": "arc"}, resume=True))
+        monte_carlo(walk, KEY, 30, 2.0, chunk=5, checkpoint=at(folder, {"motion": "arc"}, resume=True))
     with pytest.raises(ValueError, match=r"another: runs was 30, is 29$"):
-        monte_carlo(walk, KEY, 29, 2.0, parts=at(folder, {"motion": "arc"}, resume=True))
+        monte_carlo(walk, KEY, 29, 2.0, checkpoint=at(folder, {"motion": "arc"}, resume=True))
     assert len(list(folder.glob("part-*"))) >= 5
     assert chunks.compile.cache_info().misses == compiles
 
@@ -487,8 +488,8 @@ def test_a_study_whose_disk_is_full_ends_and_goes_on_later(folder):
                 later.enter_context(full_disk())
 
         with pytest.raises(OSError, match="expected to keep part 3"):
-            monte_carlo(walk, KEY, 30, 2.0, parts=parts, progress=progress, **kwargs)
+            monte_carlo(walk, KEY, 30, 2.0, checkpoint=parts, progress=progress, **kwargs)
     assert parts.runs_kept == 12
-    result = monte_carlo(walk, KEY, 30, 2.0, parts=at(folder, resume=True))
+    result = monte_carlo(walk, KEY, 30, 2.0, checkpoint=at(folder, resume=True))
     np.testing.assert_array_equal(result.value, monte_carlo(walk, KEY, 30, 2.0, chunk=4).value)
     assert result.resumed_runs == 12

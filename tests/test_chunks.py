@@ -11,7 +11,7 @@ import pytest
 from jaxlocmap import simulation
 from jaxlocmap.consistency.study import Study
 from jaxlocmap.monte_carlo import chunks, monte_carlo
-from jaxlocmap.monte_carlo.checkpoint import Parts
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint
 
 KEY = jax.random.key(0)
 DEVICES = tuple(jax.local_devices()[:1])
@@ -227,13 +227,13 @@ def test_what_was_finished_when_memory_ran_out_stays(monkeypatch, tmp_path):
         return program._replace(run=run)
 
     failing.cache_info = compile.cache_info
-    parts = Parts(tmp_path)
+    parts = Checkpoint(tmp_path)
     monkeypatch.setattr(chunks, "compile", failing)
     with pytest.raises(ValueError, match="chunk: expected one that fits"):
-        monte_carlo(Silent(3), KEY, 400, chunk=8, parts=parts, devices=DEVICES)
+        monte_carlo(Silent(3), KEY, 400, chunk=8, checkpoint=parts, devices=DEVICES)
     monkeypatch.undo()
     assert 0 < parts.runs_kept <= 29 * 8
-    resumed = monte_carlo(Silent(3), KEY, 400, chunk=8, parts=Parts(tmp_path, resume=True), devices=DEVICES)
+    resumed = monte_carlo(Silent(3), KEY, 400, chunk=8, checkpoint=Checkpoint(tmp_path, resume=True), devices=DEVICES)
     assert resumed.resumed_runs == parts.runs_kept
     np.testing.assert_array_equal(resumed.value, monte_carlo(Silent(3), KEY, 400, chunk=8, devices=DEVICES).value)
 

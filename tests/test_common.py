@@ -43,15 +43,15 @@ def test_a_program_joins_the_others_where_it_is_told_to(hosts, options, joined):
 
 def test_a_study_gets_every_option_of_the_computing(monkeypatch, tmp_path):
     parts, ran = Recorder(SimpleNamespace(runs_kept=0)), Recorder("result")
-    monkeypatch.setattr(common, "Parts", parts)
+    monkeypatch.setattr(common, "Checkpoint", parts)
     monkeypatch.setattr(common, "monte_carlo", ran)
     monkeypatch.setattr(common.jax, "local_devices", lambda: ["a", "b", "c"])
     for resume, discard in ((True, False), (False, True)):
         config = common.ComputeConfig(chunk=7, devices=2, resume=resume, discard=discard)
-        kept = common.study_parts(tmp_path, config, {"seed": 3})
+        kept = common.study_checkpoint(tmp_path, config, {"seed": 3})
         args, how = parts.calls[-1]
         assert (args, how["resume"], how["discard"]) == ((tmp_path, {"seed": 3}), resume, discard)
-    assert common.study("one run", "key", 11, "params", "world", config=config, parts=kept) == "result"
+    assert common.study("one run", "key", 11, "params", "world", config=config, checkpoint=kept) == "result"
     ((args, how),) = ran.calls
     assert args == ("one run", "key", 11, "params", "world")
     assert (how["chunk"], how["devices"], how["parts"]) == (7, ["a", "b"], kept)
@@ -180,7 +180,7 @@ def test_a_stopped_study_says_what_is_kept_and_how_to_go_on(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["a b.py", "--runs", "9"])
     parts = SimpleNamespace(runs_kept=1200, folder="out/parts")
     with pytest.raises(KeyboardInterrupt) as told:
-        common.study("run", "key", 9000, config=common.ComputeConfig(), parts=parts)
+        common.study("run", "key", 9000, config=common.ComputeConfig(), checkpoint=parts)
     assert told.value.args == (
         "1,200 of 9,000 runs are kept in out/parts; go on with\npython 'a b.py' --runs 9 --resume",
     )

@@ -14,7 +14,7 @@ import reference
 
 from jaxlocmap import GridSpec
 from jaxlocmap._internal import random
-from jaxlocmap.mapping import grid, rays
+from jaxlocmap.mapping import grid, quality, rays
 
 SIDE = 401
 SPEC = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(SIDE, SIDE - 1))

@@ -13,7 +13,7 @@ import scipy.stats
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from jaxlocmap import Config, Gaussian, Inputs, Params, init, motion, run, sensors
+from jaxlocmap import Config, Gaussian, Inputs, Params, init, motion, run, se2, sensors
 from jaxlocmap.filters import ekf
 
 MEAN = np.array([0.4, -0.3, 3.1])

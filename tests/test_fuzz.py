@@ -31,7 +31,7 @@ from test_logs import MRCLAM, woods
 from jaxlocmap import Params, logs
 from jaxlocmap.logs.matlab import read_matrices
 from jaxlocmap.mapping.ros import load_map
-from jaxlocmap.monte_carlo.checkpoint import Parts, _own_digest
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint, _own_digest
 from jaxlocmap.monte_carlo.lock import Lock
 
 INPUTS = int(os.environ.get("JAXLOCMAP_FUZZ", "2000"))
@@ -116,7 +116,7 @@ def go_on(folder):
     """With the study in the folder: with its parts that are whole, touching nothing."""
     was = contents(folder / "parts")
     whole = {part for part in range(8) if was[f"part-{part:03d}"] == SOUND["study"][f"parts/part-{part:03d}"]}
-    parts = Parts(folder, resume=True)
+    parts = Checkpoint(folder, resume=True)
     try:
         assert parts.open(STUDY, range(8)) == whole
         for part in whole:
@@ -175,7 +175,7 @@ def picture(pixels, format="png", mode=None, **options):
 def sound(tmp_path_factory):
     """Of each reader the files of a folder, by their names."""
     folder = tmp_path_factory.mktemp("sound")
-    parts = Parts(folder / "study", discard=True)
+    parts = Checkpoint(folder / "study", discard=True)
     parts.open(STUDY, range(8))
     for part in range(8):
         parts.save(part, ARRAYS)
@@ -572,7 +572,7 @@ def test_a_pipe_or_folder_in_a_study_s_place_is_not_waited_for_nor_removed(name,
     place = tmp_path / "parts" / name
     place.unlink(missing_ok=True)
     make(place)
-    parts = Parts(tmp_path, **flags)
+    parts = Checkpoint(tmp_path, **flags)
     try:
         with pytest.raises((ValueError, OSError), match=re.escape(str(tmp_path))):
             parts.open(STUDY, range(8))

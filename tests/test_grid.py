@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from jaxlocmap import GridSpec
-from jaxlocmap.mapping import grid
+from jaxlocmap.mapping import grid, quality
 
 L_OCC, L_FREE = 0.85, -0.40
 SPEC = GridSpec(origin=(-1.0, 0.5), resolution=0.25, shape=(16, 24))  # x from -1 to 5 m, y from 0.5 to 4.5 m

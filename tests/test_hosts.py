@@ -11,7 +11,7 @@ import pytest
 from programs import free_port
 
 from jaxlocmap.monte_carlo import hosts
-from jaxlocmap.monte_carlo.checkpoint import Parts
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint
 from jaxlocmap.monte_carlo.run import _exchange, monte_carlo
 
 
@@ -90,10 +90,10 @@ def test_a_study_counts_the_devices_and_resumed_runs_of_all_processes(monkeypatc
     whole = study(chunk=4)
     assert (whole.devices, whole.resumed_runs, whole.chunk) == (1, 0, 4)
     played(monkeypatch, gathered, processes=1)
-    kept = Parts(tmp_path)
-    result = study(parts=kept)
+    kept = Checkpoint(tmp_path)
+    result = study(checkpoint=kept)
     assert (result.devices, result.resumed_runs, result.chunk) == (4, 7, 3)  # ten runs on four devices
-    again = study(parts=Parts(tmp_path, resume=True))
+    again = study(checkpoint=Checkpoint(tmp_path, resume=True))
     assert (again.resumed_runs, again.chunk) == (17, 3)
     assert again.value == result.value
     assert study(chunk=4).chunk == 4

@@ -13,7 +13,7 @@ import reference
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlocmap import motion
+from jaxlocmap import motion, se2
 from jaxlocmap._internal.linalg import Matrix
 from jaxlocmap.filters import ekf
 

@@ -15,7 +15,7 @@ from jax.test_util import check_grads
 
 from jaxlocmap import Config, Gaussian, GridSpec, Inputs, Params, init, map_scans, motion, run, sensors, step
 from jaxlocmap.filters import ekf
-from jaxlocmap.mapping import grid
+from jaxlocmap.mapping import grid, quality
 
 GATE = ekf.gate_threshold(0.99, 2)
 STEPS = 12  # of a short run: the course's detector looks at steps 0, 5 and 10

@@ -49,7 +49,7 @@ def handed_to_the_study(monkeypatch, program, config):
         raise Enough
 
     monkeypatch.setattr(program, "start", started)
-    monkeypatch.setattr(program, "study_parts", parts)
+    monkeypatch.setattr(program, "study_checkpoint", parts)
     monkeypatch.setattr(program, "study", studied)
     with pytest.raises(Enough):
         program.main(config)
@@ -109,7 +109,7 @@ def test_parameters_of_consistency(monkeypatch, tmp_path, plant):
 
 def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
     """What was summed is judged beside the reference; the picture is of this study's filter."""
-    for name in ("start", "study_parts", "finish", "_print"):
+    for name in ("start", "study_checkpoint", "finish", "_print"):
         monkeypatch.setattr(consistency, name, Recorder())
     summarise, reference_of, pictured = Recorder({"anees": 3.5}), Recorder("reference"), Recorder()
     figure = Recorder()
@@ -311,7 +311,7 @@ def test_scales_go_from_an_eighth_to_eight_times_the_variance(name):
 @pytest.mark.parametrize("across", ["gate_probability", "outlier_rate"])
 def test_the_report_of_a_sweep(monkeypatch, tmp_path, plant, across):
     """Cells row by row, each of its own totals; the gate's table is by the other parameter, whichever way round."""
-    for name in ("start", "study_parts", "finish", "_print"):
+    for name in ("start", "study_checkpoint", "finish", "_print"):
         monkeypatch.setattr(sweep, name, Recorder())
     monkeypatch.setattr(sweep.plotting, "sweep_figure", figure := Recorder())
     number = {"gate_probability": (0.9, 1.0), "outlier_rate": (0.1, 0.2, 0.3)}

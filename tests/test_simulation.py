@@ -13,7 +13,7 @@ import pytest
 import reference
 import scipy.stats
 
-from jaxlocmap import Config, Gaussian, GridSpec, simulation
+from jaxlocmap import Config, Gaussian, GridSpec, se2, simulation
 from jaxlocmap._internal import random, trig
 from jaxlocmap.simulation import CAPSTONE, LOOP, Noise, Scenario
 from jaxlocmap.simulation.world import World, occupancy, ray_cast, room

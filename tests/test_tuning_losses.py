@@ -195,12 +195,12 @@ def test_the_map_is_told_the_configuration_and_the_batch(monkeypatch):
     """Each sequence with its own poses, ranges and count, and the limits of the laser by their names."""
     told = []
 
-    def predict_scans(l_occ, l_free, poses, ranges, counted, beam_angles, **limits):
-        told.append((limits, beam_angles))
+    def predict_scans(l_occ, l_free, poses, ranges, counted, **how):
+        told.append(how)
         total = l_occ + 2 * l_free + jnp.sum(poses) + jnp.sum(ranges) + jnp.sum(jnp.where(counted, 1.0, 0.0))
         return PredictiveScore(total, jnp.sum(jnp.where(counted, 1.0, 0.0)), *[jnp.zeros(3)] * 3)
 
-    monkeypatch.setattr(losses, "foresee", foresee)
+    monkeypatch.setattr(losses, "predict_scans", predict_scans)
     batch = some_of(drives())
     config = dataclasses.replace(CONFIG, min_range=0.3, max_range=7.0)
     got = losses.predictive_score(jnp.array(0.5), jnp.array(-0.25), batch, batch.truth, config=config, bins=True)

@@ -36,9 +36,9 @@ def walk(key, scale):
 
 def main(config):
     common.start(config.compute)
-    parts = common.study_parts(config.out, config.compute, {"seed": config.seed})
+    parts = common.study_checkpoint(config.out, config.compute, {"seed": config.seed})
     key = jax.random.key(config.seed)
-    result = common.study(walk, key, config.runs, 2.0, config=config.compute, parts=parts)
+    result = common.study(walk, key, config.runs, 2.0, config=config.compute, checkpoint=parts)
     values = {name: value.tolist() for name, value in result.value.items()}
     if jax.process_index() == 0:
         common.write_report(common.output_folder(config.out), {**result._asdict(), "value": values})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import importlib.metadata
 import io
 import json
 import math
@@ -12,15 +11,15 @@ import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
 from jaxlocmap import files
 from jaxlocmap.monte_carlo.lock import Lock
+from jaxlocmap.monte_carlo.plan import MOST_PARTS, Plan, digest
 
-_PARTS = 256  # at most: so little of a long study is lost when it dies
 _SYNC_EVERY = 1.0  # s; forcing a file to disk takes milliseconds, a quick study's part less
 _FOLDER, _MANIFEST = "parts", "manifest.json"
 _LARGEST_MANIFEST = 2**20  # bytes
@@ -29,68 +28,7 @@ _MARK = "jaxlocmap study"  # what a manifest is known by
 _PART_MARK = b"jaxlocmap part\n"  # and the file of a part
 
 
-class Split(NamedTuple):
-    """A study in chunks, and its chunks in at most 256 parts of (nearly) equal size. No machine plays a role."""
-
-    runs: int
-    chunk: int  # runs
-
-    @property
-    def chunks(self) -> int:
-        """How many; the last may be cut short by the end of the study."""
-        return -(-self.runs // self.chunk)
-
-    @property
-    def parts(self) -> int:
-        """How many."""
-        return min(self.chunks, _PARTS)
-
-    def chunks_of(self, part: int) -> range:
-        """The chunks of a part."""
-        return range(self.chunks * part // self.parts, self.chunks * (part + 1) // self.parts)
-
-    def runs_in(self, chunks: range) -> int:
-        """How many runs are in consecutive chunks."""
-        return min(chunks.stop * self.chunk, self.runs) - chunks.start * self.chunk
-
-    def runs_of(self, part: int) -> int:
-        """How many runs are in a part."""
-        return self.runs_in(self.chunks_of(part))
-
-
-def manifest(split: Split, program: str, key: jax.Array, args: Any, **others: Any) -> dict[str, Any]:
-    """What makes a study what it is, in plain values by name: with the same manifest, parts are the same.
-
-    Args:
-        split: how the runs are divided. program: of `chunks.lowered_text`.
-        key, args: of the study. **others: what else must be the same.
-    """
-    sources = sorted(Path(__file__).parent.rglob("*.py"))
-    return {
-        **split._asdict(),
-        **others,
-        "key": f"{key.dtype} {jax.random.key_data(key).tolist()}",
-        "arguments": _digest(*(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(args))),
-        "program": _digest(program.encode()),
-        "precision": str(jax.dtypes.canonicalize_dtype(float)),
-        "jax": f"{jax.__version__}, jaxlib {importlib.metadata.version('jaxlib')}",
-        "xla_flags": os.environ.get("XLA_FLAGS", ""),
-        "jaxlocmap": f"{_version()} {_digest(*(source.read_bytes() for source in sources))}",
-    }
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("jaxlocmap")
-    except importlib.metadata.PackageNotFoundError:  # used from its sources
-        return "not installed"
-
-
-def _digest(*contents: bytes) -> str:
-    return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in contents)).hexdigest()[:16]
-
-
-class Parts:
+class Checkpoint:
     """Where a study keeps its finished parts: a folder `parts` of its own, in the folder of its report.
 
     A part's file is written under another name and then renamed, so it is there whole or not at all. Its checksum
@@ -199,7 +137,7 @@ class Parts:
         if not self.resume or found is None:
             self._discard(found)
             self._write(
-                _MANIFEST, json.dumps({"made by": _MARK, "digest": _own_digest(asked), **asked}, indent=1).encode()
+                _MANIFEST, json.dumps({"made by": _MARK, "digest": _owndigest(asked), **asked}, indent=1).encode()
             )
         self._manifest = asked
         whole = {part for part in parts if self._is_whole(part)}
@@ -277,8 +215,8 @@ class Parts:
         """The manifest in the folder; None if there is none, or none that can be believed."""
         try:
             found = json.loads(files.read(self.folder / _MANIFEST, most=_LARGEST_MANIFEST))
-            if found.pop("made by") == _MARK and found.pop("digest") == _own_digest(found):
-                return found if all(type(found[name]) is int and found[name] > 0 for name in Split._fields) else None
+            if found.pop("made by") == _MARK and found.pop("digest") == _owndigest(found):
+                return found if all(type(found[name]) is int and found[name] > 0 for name in Plan._fields) else None
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             pass
         return None
@@ -287,8 +225,8 @@ class Parts:
         return json.loads(json.dumps({**self.settings, **manifest}))  # as it will be read again
 
     @staticmethod
-    def _split(manifest: Mapping[str, Any]) -> Split:
-        return Split(manifest["runs"], manifest["chunk"])
+    def _split(manifest: Mapping[str, Any]) -> Plan:
+        return Plan(manifest["runs"], manifest["chunk"])
 
     def _discard(self, found: dict[str, Any] | None) -> None:
         if self.resume:
@@ -305,7 +243,7 @@ class Parts:
 
     def _part_files(self) -> list[Path]:
         """Files that are named like parts."""
-        return [file for part in range(_PARTS) if (file := self.folder / _name(part)).exists()]
+        return [file for part in range(MOST_PARTS) if (file := self.folder / _name(part)).exists()]
 
     def _runs_there(self, manifest: Mapping[str, Any]) -> int:
         split = self._split(manifest)
@@ -345,8 +283,8 @@ def _name(part: int) -> str:
     return f"part-{part:03d}"
 
 
-def _own_digest(study: Mapping[str, Any]) -> str:
-    return _digest(json.dumps(study, sort_keys=True).encode())
+def _owndigest(study: Mapping[str, Any]) -> str:
+    return digest(json.dumps(study, sort_keys=True).encode())
 
 
 def _is_part(file: Path) -> bool:

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap.monte_carlo import chunks, hosts
-from jaxlocmap.monte_carlo.checkpoint import Parts, Split, manifest
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint
 from jaxlocmap.monte_carlo.hosts import use_all_cores
+from jaxlocmap.monte_carlo.plan import Plan, manifest
 
 __all__ = ["Result", "monte_carlo", "use_all_cores"]
 
@@ -45,7 +46,7 @@ def monte_carlo(
     keep_runs: bool = False,
     devices: Sequence[Any] | None = None,
     progress: Callable[[int], None] | None = None,
-    parts: Parts | None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Result:
     """Run a simulation many times and add up what it returns.
 
@@ -72,15 +73,15 @@ def monte_carlo(
         keep_runs: return each run's own values instead of their sums; in one process only.
         devices: of `jax.local_devices()`, all by default.
         progress: called with the number of runs done after each turn of the devices; in several processes, as if the
-            others were as far as this one. What it raises ends the study, with every finished part kept in `parts`.
-        parts: where to keep what is finished. `parts.clear()` is the caller's to call, once the result is safe.
+            others were as far as this one. What it raises ends the study, with every finished part kept on disk.
+        checkpoint: where to keep what is finished; `clear()` is the caller's to call, once the result is safe.
 
     Returns:
         `Result`, the same in every process.
 
     Raises:
         ValueError: `runs` or `chunk` below 1 or no whole number, a chunk that does not fit into memory, no device,
-            or `parts` that should be resumed and belong to another study, or hold files that are not a study's.
+            or a checkpoint that should be resumed and belongs to another study, or holds files that are no study's.
         TypeError: a key that is none.
         OSError: a part cannot be kept; those kept before stay. BlockingIOError: another study works in its folder.
     """
@@ -94,8 +95,8 @@ def monte_carlo(
     process, processes = jax.process_index(), jax.process_count()
     if keep_runs and processes > 1:
         raise ValueError(f"keep_runs: expected one process, got {processes}")
-    if chunk is None and parts is not None:
-        chunk = parts.recorded_chunk()
+    if chunk is None and checkpoint is not None:
+        chunk = checkpoint.recorded_chunk()
     counts, chosen = hosts.gather(np.array([len(devices), min(chunk or 0, runs)], np.int32)).T
 
     began, compiled = time.perf_counter(), chunks.compile.cache_info().misses
@@ -105,43 +106,43 @@ def monte_carlo(
     chunk = int(chosen[0])
     if not chunk:  # compilers on different machines may foresee different needs
         chunk = int(hosts.gather(np.array(chunks.choose(run, runs, int(counts.sum()), devices), np.int32)).min())
-    split = Split(runs, chunk)
+    plan = Plan(runs, chunk)
     study: dict[str, Any] = {}
-    if parts is not None or processes > 1:
-        study = manifest(split, chunks.lowered_text(run), key, args, keep_runs=keep_runs, platform=platform)
+    if checkpoint is not None or processes > 1:
+        study = manifest(plan, chunks.lowered_text(run), key, args, keep_runs=keep_runs, platform=platform)
         _check_agreement(study)
-    if parts is not None:
-        hosts.in_turn(lambda: parts.check(study))
-    program = chunks.compile(run, split.chunk, devices)
+    if checkpoint is not None:
+        hosts.in_turn(lambda: checkpoint.check(study))
+    program = chunks.compile(run, plan.chunk, devices)
     program.check_memory()
     compile_s = time.perf_counter() - began if chunks.compile.cache_info().misses > compiled else 0.0
 
-    own, finished = range(process, split.parts, processes), set[int]()
+    own, finished = range(process, plan.parts, processes), set[int]()
     try:
-        if parts is not None:
-            finished = hosts.in_turn(lambda: parts.open(study, own))
-        resumed = sum(map(split.runs_of, finished))
+        if checkpoint is not None:
+            finished = hosts.in_turn(lambda: checkpoint.open(study, own))
+        resumed = sum(map(plan.runs_of, finished))
         resumed_runs = int(hosts.gather(np.array(resumed, np.int64)).sum())
-        if parts is not None and resumed_runs:
-            parts.say(f"going on: {resumed_runs:,} of {runs:,} runs are done")
+        if checkpoint is not None and resumed_runs:
+            checkpoint.say(f"going on: {resumed_runs:,} of {runs:,} runs are done")
         began = time.perf_counter()
 
         def report(computed: int) -> None:
             if progress is not None:
-                progress(runs * (resumed + computed) // sum(map(split.runs_of, own)))
+                progress(runs * (resumed + computed) // sum(map(plan.runs_of, own)))
 
-        todo = (each for part in own if part not in finished for each in split.chunks_of(part))
-        computed = _compute(program, split, todo, (key, args), report)
+        todo = (each for part in own if part not in finished for each in plan.chunks_of(part))
+        computed = _compute(program, plan, todo, (key, args), report)
         combine = _concatenate if keep_runs else _add_up
-        totals = _totals(own, finished, split, computed, combine, parts)
+        totals = _totals(own, finished, plan, computed, combine, checkpoint)
         if processes > 1:
-            totals = _exchange(list(totals), split.parts, traced.outputs)
+            totals = _exchange(list(totals), plan.parts, traced.outputs)
         total, run_s = combine(totals), time.perf_counter() - began
         value = _kept(total, traced.outputs, runs) if keep_runs else _unpacked(total, traced.outputs)
-        return Result(value, split.chunk, int(counts.sum()), processes, resumed_runs, compile_s, run_s)
+        return Result(value, plan.chunk, int(counts.sum()), processes, resumed_runs, compile_s, run_s)
     finally:
-        if parts is not None:
-            parts.release()
+        if checkpoint is not None:
+            checkpoint.release()
 
 
 def _check_key(key: Any) -> None:
@@ -158,36 +159,36 @@ def _check_agreement(study: dict[str, Any]) -> None:
 
 
 def _compute(
-    program: chunks.Program, split: Split, todo: Iterator[int], shared: Any, report: Callable[[int], None]
+    program: chunks.Program, plan: Plan, todo: Iterator[int], shared: Any, report: Callable[[int], None]
 ) -> Iterator[_Arrays]:
     """Chunk after chunk, as many at a turn as there are devices."""
-    runs, shared = program.place((np.int32(split.runs), shared))
+    runs, shared = program.place((np.int32(plan.runs), shared))
     devices, done = program.mesh.size, 0
     while turn := list(itertools.islice(todo, devices)):
         idle = [0] * (devices - len(turn))  # what these devices compute is not looked at
-        first = np.array([each * split.chunk for each in turn] + idle, np.int32)
+        first = np.array([each * plan.chunk for each in turn] + idle, np.int32)
         arrays = program.compute(first, runs, *shared)
         yield from itertools.islice(zip(*arrays, strict=True), len(turn))
-        done += sum(split.runs_in(range(each, each + 1)) for each in turn)
+        done += sum(plan.runs_in(range(each, each + 1)) for each in turn)
         report(done)
 
 
 def _totals(
     own: range,
     finished: set[int],
-    split: Split,
+    plan: Plan,
     computed: Iterator[_Arrays],
     combine: Callable[[Iterable[_Arrays]], _Arrays],
-    parts: Parts | None,
+    checkpoint: Checkpoint | None,
 ) -> Iterator[_Arrays]:
     """Part after part, from disk where it is finished, else computed and kept."""
     for part in own:
-        if parts is not None and part in finished:
-            yield parts.load(part)
+        if checkpoint is not None and part in finished:
+            yield checkpoint.load(part)
             continue
-        total = combine(itertools.islice(computed, len(split.chunks_of(part))))
-        if parts is not None:
-            parts.save(part, total)
+        total = combine(itertools.islice(computed, len(plan.chunks_of(part))))
+        if checkpoint is not None:
+            checkpoint.save(part, total)
         yield total
     for _ in computed:  # nothing is left but the last report
         pass
