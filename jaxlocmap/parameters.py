@@ -31,7 +31,9 @@ class Block(NamedTuple):
 
     @property
     def correlations(self) -> tuple[str, ...]:
-        """Names of the correlations of a covariance, row by row below the diagonal: "a_b" of components a and b."""
+        """Names of the correlations of a covariance, row by row below the diagonal: "a_b" of components a and b. One
+        component has none, nor has a number.
+        """
         pairs = [(i, j) for i in range(len(self.components)) for j in range(i)]
         return tuple(f"{self.components[j]}_{self.components[i]}" for i, j in pairs)
 

@@ -26,12 +26,12 @@ def blocks_of(config: Config) -> tuple[Block, ...]:
 
 def names_of(blocks: tuple[Block, ...]) -> tuple[str, ...]:
     """The parameters of blocks: of a covariance its standard deviations by component, then the correlations "a_b"."""
-    return tuple(name for block in blocks for name in (*block.components, *_correlations(block)))
+    return tuple(name for block in blocks for name in (*block.components, *block.correlations))
 
 
 def correlations_of(blocks: tuple[Block, ...]) -> tuple[str, ...]:
     """The parameters that are correlations."""
-    return tuple(name for block in blocks for name in _correlations(block))
+    return tuple(name for block in blocks for name in block.correlations)
 
 
 def units_of(blocks: tuple[Block, ...]) -> dict[str, str]:
@@ -136,10 +136,6 @@ def natural(params: Params, blocks: tuple[Block, ...] = BLOCKS) -> dict[str, jax
         else:
             values[block.name] = value
     return values
-
-
-def _correlations(block: Block) -> tuple[str, ...]:
-    return block.correlations if block.kind == "covariance" else ()
 
 
 def _cholesky(cov: jax.Array) -> list[list[jax.Array]]:
