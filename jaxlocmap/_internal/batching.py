@@ -90,9 +90,7 @@ def unstack(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
     """
     leaves, structure = jax.tree.flatten(tree)
     leaves = [jnp.asarray(leaf) for leaf in leaves]
-    shapes = [
-        leaf.shape if leaf.ndim in (1, 2) and 0 < min(leaf.shape) <= max(leaf.shape) <= SMALL else () for leaf in leaves
-    ]
+    shapes = [leaf.shape if _is_small(leaf.shape) else () for leaf in leaves]
     scalars = [
         leaf[i] if shape else leaf for leaf, shape in zip(leaves, shapes, strict=True) for i in np.ndindex(shape)
     ]
@@ -107,6 +105,13 @@ def unstack(tree: Any) -> tuple[list[Any], Callable[[list[Any]], Any]]:
         return jax.tree.unflatten(structure, whole)
 
     return scalars, stack
+
+
+def _is_small(shape: tuple[int, ...]) -> bool:
+    """Whether this is a vector or square matrix of a small state, or has no more entries than a 3x3 matrix."""
+    if len(shape) == 2 and shape[0] != shape[1]:
+        return 0 < shape[0] * shape[1] <= 9
+    return len(shape) in (1, 2) and 0 < shape[0] <= SMALL
 
 
 def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any, *, unroll: int = 1) -> tuple[Any, Any]:

@@ -17,7 +17,7 @@ import numpy as np
 
 Scalar = Any  # a Python number or an array of shape ()
 
-SMALL = 9  # the largest dimension that is unrolled: above, programs grow faster than they gain
+SMALL = 12  # the largest dimension that is unrolled: beyond, programs take longer to compile than they gain
 
 
 def stack_scalars(entries: Any) -> jax.Array:
