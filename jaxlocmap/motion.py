@@ -42,7 +42,7 @@ class MotionModel(NamedTuple):
         """The length q of u."""
         return sum(len(block.components) for block in self.noise)
 
-    def full_input(self, control: jax.Array) -> jax.Array:
+    def full_input(self, control: jax.Array, name: str = "control") -> jax.Array:
         """The control, followed by zeros: u (q,).
 
         Raises:
@@ -50,8 +50,8 @@ class MotionModel(NamedTuple):
         """
         ends = list(itertools.accumulate(len(block.components) for block in self.noise))
         if np.ndim(control) != 1 or len(control) not in ends:
-            wanted = " or ".join(f"({end},)" for end in ends)
-            raise ValueError(f"control: expected shape {wanted}, as the motion model takes, got {np.shape(control)}")
+            wanted = " or ".join(f"({end})" for end in ends)
+            raise ValueError(f"{name}: expected shape {wanted}, got {np.shape(control)}")
         rest = self.inputs - len(control)
         return jnp.concatenate([control, jnp.zeros(rest, control.dtype)]) if rest else control
 

@@ -277,7 +277,7 @@ def _check_step(
     if config.grid is not None and state.log_odds is None:
         raise ValueError("state.log_odds: expected a map, as init makes with this config, got None")
     checks.shape("inputs.dt", inputs.dt, ())
-    model.full_input(inputs.control)
+    model.full_input(inputs.control, "inputs.control")
     checks.shape("inputs.valid", inputs.valid, (None,))
     slots = np.shape(inputs.valid)[0]
     checks.shape("inputs.landmark", inputs.landmark, (slots,))

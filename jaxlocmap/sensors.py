@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxlocmap import checks
 from jaxlocmap._internal.linalg import Matrix, mahalanobis, quadratic_form
@@ -214,7 +215,8 @@ def innovation_covariance(cov: jax.Array, H: Matrix) -> Matrix:
 
 def _mounted(state: jax.Array, landmark: Any, sensor: Sensor, offset: Offset) -> tuple[jax.Array, Matrix]:
     """The state with the sensor's pose in the place of the robot's, and the Jacobian of the one by the other."""
-    checks.shape("state", state, (None,))
+    if np.ndim(state) != 1 or len(state) < POSE:
+        raise ValueError(f"state: expected shape (n), n of at least {POSE}, got {np.shape(state)}")
     if sensor.landmarks:
         checks.shape("landmark", landmark, (2,))
     pose, J = compose(state[:POSE], offset)

@@ -203,8 +203,8 @@ def is_valid(belief: Gaussian) -> jax.Array:
         ValueError: a wrong shape.
     """
     mean, cov = belief
-    checks.shape("mean", mean, (None,))
-    checks.shape("cov", cov, (len(mean), len(mean)))
+    checks.shape("cov", cov, (None, None))
+    checks.shapes(mean=(mean, (len(cov),)), cov=(cov, (len(cov), len(cov))))
     rest = functools.reduce(jnp.add, [mean[i] for i in range(2, len(mean))])
     return is_psd(cov) & is_held(mean[0], mean[1]) & jnp.isfinite(rest)
 

@@ -1,4 +1,4 @@
-"""Short simulated drives to tune on."""
+"""Scenarios like others, and short simulated drives to tune on."""
 
 import dataclasses
 import functools
@@ -7,15 +7,23 @@ import jax
 
 from jaxlocmap import GridSpec, simulation, tuning
 
-# In sight of all four landmarks, which the detector looks for in every second step.
-SHORT = dataclasses.replace(
+
+def like(scenario, *, detector=None, robot=None, **changes):
+    """A scenario with some fields changed, of its detector and its robot too."""
+    detector = dataclasses.replace(scenario.detector, **(detector or {}))
+    robot = dataclasses.replace(scenario.robot, **(robot or {}))
+    return dataclasses.replace(scenario, detector=detector, robot=robot, **changes)
+
+
+# In sight of all four landmarks, which the detector reports in every second step.
+SHORT = like(
     simulation.CAPSTONE,
     name="short",
     start=(6.0, 8.5, 0.5),
     steps=12,
     beams=9,
-    sight_period=2,
-    grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20)),
+    detector=dict(period=2),
+    robot=dict(grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20))),
 )
 OWN = simulation.own_params(simulation.Noise(), SHORT)
 CONFIG = SHORT.config(motion="euler", gate_probability=0.9999)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlocmap._internal.linalg import Matrix, forward, is_psd, ldl, mahalanobis, quadratic_form, solve, stack
+from jaxlocmap._internal.linalg import Matrix, forward, is_psd, ldl, mahalanobis, quadratic_form, solve, stack_scalars
 
 
 def random_psd(rng, n, rank=None):
@@ -68,7 +68,7 @@ def test_stacked_scalars_are_numpys_array():
     for shape in ((1,), (3,), (1, 1), (2, 3), (3, 1)):
         expected = np.asarray(jnp.array(rng.normal(size=shape)))
         # As a function takes them apart and puts them together, for one and for many.
-        rebuilt = jax.jit(lambda x, shape=shape: stack(parts(x, shape)))
+        rebuilt = jax.jit(lambda x, shape=shape: stack_scalars(parts(x, shape)))
         np.testing.assert_array_equal(rebuilt(expected), expected)
         np.testing.assert_array_equal(jax.vmap(rebuilt)(expected[None].repeat(4, 0)), expected[None].repeat(4, 0))
 
@@ -83,7 +83,7 @@ def test_reading_an_entry_of_a_stacked_matrix_costs_nothing():
     """The compiled program of a batch holds the one entry that is asked for, and nothing of how it was stacked."""
 
     def entry(x):
-        return stack([[x[0], x[1]], [x[2], 2 * x[3]]])[1, 0]
+        return stack_scalars([[x[0], x[1]], [x[2], 2 * x[3]]])[1, 0]
 
     program = jax.jit(jax.vmap(entry, in_axes=1)).lower(jnp.ones((4, 50))).compile().as_text()
     assert "slice(" in program
@@ -92,7 +92,7 @@ def test_reading_an_entry_of_a_stacked_matrix_costs_nothing():
 
 
 def psd(P):
-    return bool(is_psd(Matrix.of(jnp.asarray(P, float))))
+    return bool(is_psd(jnp.asarray(P, float)))
 
 
 @given(seed=st.integers(0, 10_000), rank=st.sampled_from([1, 2, 3]), scale=st.sampled_from([1e-6, 1.0, 1e6]))

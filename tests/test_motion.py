@@ -112,17 +112,20 @@ SHAPES = {"pose": (3,), "control": (2,), "dt": ()}
 def test_a_batch_is_refused_by_name(model, name):
     """Five poses side by side would be taken for one, of which only the first three count."""
     arrays = {key: jnp.ones(shape) for key, shape in SHAPES.items()}
+    own = {"pose": "state", "control": "u"} if model not in motion.MODELS.values() else {}
     for wrong in ((5, *SHAPES[name]), (*SHAPES[name], 1), (1,)):
-        for function in model:
-            with pytest.raises(ValueError, match=rf"^{name}: expected shape .*, got {re.escape(str(wrong))}"):
+        for function in (model.transition, model.jacobians):
+            with pytest.raises(
+                ValueError, match=rf"^{own.get(name, name)}: expected shape .*, got {re.escape(str(wrong))}"
+            ):
                 function(*(arrays | {name: jnp.ones(wrong)}).values())
 
 
 @pytest.mark.parametrize("result", [(2,), (4,), (3, 3)])
 def test_a_transition_that_returns_no_pose_is_refused(result):
     own = motion.from_transition(lambda pose, control, dt: jnp.full(result, pose[0]))
-    for function in own:
-        with pytest.raises(ValueError, match=r"^transition\(pose, control, dt\): expected shape \(3\), got"):
+    for function in (own.transition, own.jacobians):
+        with pytest.raises(ValueError, match=r"^transition\(state, u, dt\): expected shape \(3\), got"):
             function(jnp.zeros(3), jnp.zeros(2), 0.1)
 
 

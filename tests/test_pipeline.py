@@ -13,9 +13,11 @@ import reference
 from jax.sharding import Mesh, PartitionSpec
 from jax.test_util import check_grads
 
-from jaxlocmap import Config, Gaussian, GridSpec, Inputs, Params, init, map_scans, motion, run, sensors, step
+from jaxlocmap import Config, Gaussian, GridSpec, Inputs, init, map_scans, motion, run, sensors, step
 from jaxlocmap.filters import ekf
 from jaxlocmap.mapping import grid, quality
+from jaxlocmap.step import correct, is_held, is_valid, predict
+from jaxlocmap.types import Scanner
 
 GATE = ekf.gate_threshold(0.99, 2)
 STEPS = 12  # of a short run: the course's detector looks at steps 0, 5 and 10
@@ -458,23 +460,24 @@ def test_float32_in_float32_out(single):
 
 
 def test_every_atom_keeps_float32(single):
-    spec, reach = single.grid, {"min_range": 0.05, "max_range": 8.0}
+    spec = single.grid
     offset = (0.1, 0.2, 0.3)
 
     @jax.jit
     def every_atom(params, prior, inputs, mark, beam_angles):
         (mean, cov), z, control, dt = prior, inputs.z[0], inputs.control, inputs.dt
-        residual, H, _ = sensors.linearise(mean, mark, z, offset)
+        residual, H, _ = sensors.linearise(mean, mark, z, offset=offset)
         empty = jnp.zeros(spec.shape, jnp.float32)
+        scanner = Scanner(beam_angles, (0.0, 0.0, 0.0), 0.05, 8.0)
         log_odds = grid.update_log_odds(
-            empty, mean, inputs.ranges, beam_angles, params.l_occ, params.l_free, spec=spec, **reach
+            empty, mean, inputs.ranges, params.l_occ, params.l_free, scanner=scanner, spec=spec
         )
         occupied = log_odds > 0
         return {
             "transition": [model.transition(mean, control, dt) for model in motion.MODELS.values()],
             "predict": ekf.predict(mean, cov, control, dt, params.Q, motion=motion.ARC, nominal_dt=0.1),
             "update": ekf.update(mean, cov, residual, H, params.R, threshold=GATE),
-            "sensor": [residual, H.array(jnp.float32), sensors.observe(mean, mark, offset)],
+            "sensor": [residual, H.array(jnp.float32), sensors.observe(mean, mark, offset=offset)],
             "wheels": [motion.from_wheels(dt, z[0], 0.4), motion.to_wheels(control, 0.4)],
             "map": [log_odds, grid.probability(log_odds), quality.entropy_bits(log_odds)],
             "brier": quality.brier(log_odds, occupied, occupied),
@@ -626,7 +629,7 @@ def test_what_is_not_said_of_a_step_is_taken_for_its_own_reason(course):
     """Standing still for the time that passed, or moving not at all for a nominal time; told, either way."""
     belief = Gaussian(jnp.array([1.0, 2.0, 0.5]), jnp.eye(3) * 1e-4)
     go, config = jnp.array([0.7, 0.3]), course.config()
-    predict = jax.jit(functools.partial(step.predict, config=config))
+    predicted = jax.jit(functools.partial(predict, config=config))
     for control, dt, taken, usable in (
         (go, 0.0, (go, 0.0), True),
         (go, 0.4, (go, 0.4), True),
@@ -636,7 +639,7 @@ def test_what_is_not_said_of_a_step_is_taken_for_its_own_reason(course):
         (go, -0.4, (0 * go, config.dt), False),
         (go, jnp.inf, (0 * go, config.dt), False),
     ):
-        got, was_usable = predict(course.params, belief, control, jnp.array(dt))
+        got, was_usable = predicted(course.params, belief, control, jnp.array(dt))
         arguments = *belief, taken[0], jnp.array(taken[1]), course.params.Q
         expected = ekf.predict(*arguments, motion=motion.ARC, nominal_dt=config.dt)
         chex.assert_trees_all_close(tuple(got), expected, rtol=1e-6, atol=1e-9)
@@ -648,45 +651,46 @@ def test_what_is_not_said_of_a_step_is_taken_for_its_own_reason(course):
 )
 def test_a_belief_is_sound_if_all_of_it_is(place, bad):
     mean, cov = jnp.array([1.0, 2.0, 0.5]), jnp.eye(3)
-    assert step.sound(Gaussian(mean, cov))
-    assert not step.sound(Gaussian(mean.at[place].set(bad), cov))
-    assert not step.sound(Gaussian(mean, cov.at[place, place].set(bad)))
-    assert not step.sound(Gaussian(mean, cov.at[place, place].set(-1.0)))
+    assert is_valid(Gaussian(mean, cov))
+    assert not is_valid(Gaussian(mean.at[place].set(bad), cov))
+    assert not is_valid(Gaussian(mean, cov.at[place, place].set(bad)))
+    assert not is_valid(Gaussian(mean, cov.at[place, place].set(-1.0)))
 
 
 def test_a_place_is_held_below_16384_m_in_float32_on_either_side_of_either_axis():
     far, near = 16_384, 16_384 - 2**-10
     places = [[near, 0], [far, 0], [-near, 0], [-far, 0], [0, far], [0, -far], [near, -near]]
     x, y = jnp.array(places, jnp.float32).T
-    np.testing.assert_array_equal(step.is_held(x, y), [True, False, True, False, False, False, True])
-    assert not step.is_held(jnp.array(jnp.nan), jnp.array(0.0))
+    np.testing.assert_array_equal(is_held(x, y), [True, False, True, False, False, False, True])
+    assert not is_held(jnp.array(jnp.nan), jnp.array(0.0))
 
 
 def test_a_range_is_one_above_zero_and_a_bearing_any_number():
     reach = jnp.array([1e-9, 0.0, -0.0, -1.0, jnp.nan, jnp.inf, 1.0, 1.0, 1.0, 1.0])
     bearing = jnp.array([9.0, 0.0, 0.0, 0.0, 0.0, 0.0, -0.0, jnp.nan, jnp.inf, -jnp.inf])
     expected = [True, False, False, False, False, False, True, False, False, False]
-    np.testing.assert_array_equal(step.is_measurement(reach, bearing), expected)
+    got = jax.vmap(sensors.RANGE_BEARING.is_measurement)(jnp.stack([reach, bearing], axis=1))
+    np.testing.assert_array_equal(got, expected)
 
 
-@pytest.mark.parametrize("softness", [0.0, 1.0])
-def test_an_observation_whose_covariance_is_none_is_reported_and_not_called_used(softness, course):
+@pytest.mark.parametrize("temperature", [0.0, 1.0])
+def test_an_observation_whose_covariance_is_none_is_reported_and_not_called_used(temperature, course):
     """R = -9 I makes that of the innovation negative."""
-    correct = jax.jit(functools.partial(step.correct, config=course.config(gate_temperature=softness)))
+    corrected = jax.jit(functools.partial(correct, config=course.config(gate_temperature=temperature)))
     belief = Gaussian(jnp.array([1.0, 2.0, 0.0]), jnp.eye(3) * 1e-4)
     rest = jnp.array([1.01, 0.01]), jnp.array([2.0, 2.0]), jnp.array(3, jnp.int32), jnp.array(True)
     for R, fine in ((course.params.R, True), (-9 * jnp.eye(2), False)):
-        after, sighting, used = correct(course.params._replace(R=R), belief, *rest)
-        assert (bool(used), bool(sighting.accepted), int(sighting.row)) == (fine, fine, 3)
-        assert bool(jnp.isfinite(sighting.nis)) is fine
+        after, observation, used = corrected(course.params._replace(R=R), belief, *rest)
+        assert (bool(used), bool(observation.accepted), int(observation.row)) == (fine, fine, 3)
+        assert bool(jnp.isfinite(observation.nis)) is fine
         assert bool(jnp.all(after.cov == belief.cov)) is not fine
     # Just outside the gate, where a hard one decides and a soft one weighs.
-    after, sighting, used = correct(course.params, belief, rest[0].at[0].set(1.48), *rest[1:])
-    assert (bool(used), bool(sighting.accepted), float(sighting.nis) > 9.21) == (True, False, True)
-    assert bool(jnp.all(after.mean == belief.mean)) is (softness == 0)
-    _, sighting, used = correct(course.params, belief, *rest[:3], jnp.array(False))
-    assert (bool(used), bool(sighting.accepted), int(sighting.row)) == (False, False, -1)
-    assert not any(np.any(x) for x in sighting._replace(row=0))
+    after, observation, used = corrected(course.params, belief, rest[0].at[0].set(1.48), *rest[1:])
+    assert (bool(used), bool(observation.accepted), float(observation.nis) > 9.21) == (True, False, True)
+    assert bool(jnp.all(after.mean == belief.mean)) is (temperature == 0)
+    _, observation, used = corrected(course.params, belief, *rest[:3], jnp.array(False))
+    assert (bool(used), bool(observation.accepted), int(observation.row)) == (False, False, -1)
+    assert not any(np.any(x) for x in observation._replace(row=0))
 
 
 def test_what_is_collected_of_a_map_is_within_its_bounds(course):
@@ -886,8 +890,8 @@ def refused(course, error, message, *, config=SCANNING, params=None, **fields):
     arguments = {"landmarks": course.landmarks, "beam_angles": course.beam_angles}
     for name in arguments.keys() & fields.keys():
         arguments[name] = fields.pop(name)
-    state = init(course.prior, config=config)
     with pytest.raises(error, match=message):
+        state = init(course.prior, config=config)
         run(params or course.params, state, inputs._replace(**fields), config=config, **arguments)
 
 
@@ -960,7 +964,7 @@ def test_an_unknown_motion_model_is_refused(course):
 
 
 def test_parameters_that_are_traced_are_not_looked_at(short, config):
-    wrong = Params(*(x * 0 for x in short.params))
+    wrong = jax.tree.map(lambda x: x * 0, short.params)
     _, info = localise(short._replace(params=wrong), config)
     assert info.ok.shape == (STEPS,)
 
@@ -1018,11 +1022,11 @@ def test_what_a_step_is_made_of_refuses_a_batch_by_name(name, course):
     shapes = {"control": (2,), "dt": (), "z": (2,), "landmark": (2,), "row": (), "usable": (), "mean": (3,)}
     shapes["cov"] = (3, 3)
     parts = (
-        lambda of: step.predict(course.params, of("mean", "cov"), of("control"), of("dt"), config=Config()),
-        lambda of: step.correct(
+        lambda of: predict(course.params, of("mean", "cov"), of("control"), of("dt"), config=Config()),
+        lambda of: correct(
             course.params, of("mean", "cov"), of("z"), of("landmark"), of("row"), of("usable") > 0, config=Config()
         ),
-        lambda of: step.sound(of("mean", "cov")),
+        lambda of: is_valid(of("mean", "cov")),
     )
     uses = ({"control", "dt", "mean", "cov"}, {"z", "landmark", "row", "usable", "mean", "cov"}, {"mean", "cov"})
     for wrong in ((5, *shapes[name]), (1,)):

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 import pytest
 import reference
+from drives import like
 from programs import Enough, Recorder, stop
 
 from jaxlocmap import Gaussian, Params, simulation
@@ -406,7 +407,7 @@ def test_the_detector_of_the_course_goes_by_what_it_measures(monkeypatch):
     truth, inputs = capstone.course_drive(17, simulation.CAPSTONE, world)
     assert (truth, inputs["valid"].tolist()) == ("truth", [[True, False], [False, True]])
     assert draws.calls[0][0] == (17, simulation.CAPSTONE, 4)
-    assert rolled.calls[0][1]["scenario"].sight_range == math.inf
+    assert rolled.calls[0][1]["scenario"].detector.max_range == math.inf
 
 
 @pytest.fixture
@@ -415,8 +416,8 @@ def course_report(monkeypatch, tmp_path):
     truth = np.array([[0, 0, 0], [1, 1, 0], [2, 2, 3.1], [3, 3, 0]], float)
     off = np.array([[0.3, 0.4, 0], [0, 0, 0.2], [0, 0, 0.1 - 2 * math.pi], [0, 0.5, 0]])
     belief = Gaussian(truth - off, np.array([np.diag([0.25, 0.25, 0.01])] * 4))
-    scenario = dataclasses.replace(
-        simulation.CAPSTONE, steps=4, grid=dataclasses.replace(simulation.CAPSTONE.grid, shape=(2, 3))
+    scenario = like(
+        simulation.CAPSTONE, steps=4, robot=dict(grid=dataclasses.replace(simulation.CAPSTONE.robot.grid, shape=(2, 3)))
     )
     monkeypatch.setattr(capstone.simulation, "CAPSTONE", scenario)
     log_odds = np.array([[0.0, 2.0, -1.0], [0.0, 0.0, 3.0]])

@@ -1,5 +1,7 @@
 """What one run adds to a study, from steps and observations made up by hand."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,10 @@ import pytest
 
 from jaxlocmap import Gaussian
 from jaxlocmap.consistency import scoring
-from jaxlocmap.step import Sighting
+from jaxlocmap.step import Observation
 
-scored = jax.jit(scoring.score_step)
-sighted = jax.jit(scoring.score_sighting)
+scored = jax.jit(functools.partial(scoring.score_step, angles=(2,)))
+sighted = jax.jit(scoring.score_observation)
 totals = jax.jit(lambda *args: scoring.run_totals(*args, None, length=8, exact_start=False))
 
 
@@ -43,7 +45,7 @@ def test_a_step_is_within_two_sigma_of_each_axis_and_inside_each_ellipsoid():
     np.testing.assert_allclose(tally.phase_nees, [0, 0, float(tally.nees), 0])
     np.testing.assert_allclose(square, [0.199**2, 0.402**2, 0.03**2], rtol=1e-4)
     np.testing.assert_allclose(variance, [0.01, 0.04, 0.09], rtol=1e-6)
-    assert (float(tally.scored), float(tally.flagged), float(tally.lost)) == (1, 0, 0)
+    assert (float(tally.scored), float(tally.flagged), float(tally.diverged)) == (1, 0, 0)
     assert float(step([0.0, 0.0, 0.0], np.eye(3), ok=False)[0].flagged) == 1
 
 
@@ -53,8 +55,8 @@ def test_an_indefinite_covariance_counts_nowhere():
     assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves((tally, square, variance)))
 
 
-def sighting(innovation=(0.3, 0.1), S=((0.09, 0.0), (0.0, 0.04)), nis=1.25, accepted=True):
-    return Sighting(*[None] * len(Sighting._fields))._replace(
+def observation(innovation=(0.3, 0.1), S=((0.09, 0.0), (0.0, 0.04)), nis=1.25, accepted=True):
+    return Observation(*[None] * len(Observation._fields))._replace(
         innovation=jnp.array(innovation), S=jnp.array(S), nis=jnp.array(nis), accepted=jnp.array(accepted)
     )
 
@@ -67,23 +69,23 @@ def seen(white=None):
 def test_an_observation_is_paired_with_the_one_before_it():
     """Whitened it is (1, 0.5)."""
     yes, no = jnp.array(True), jnp.array(False)
-    tally, latest = sighted(sighting(), yes, yes, seen((2.0, -4.0)))
+    tally, latest = sighted(observation(), yes, yes, seen((2.0, -4.0)))
     np.testing.assert_allclose(tally.lag_products, [2, -2], rtol=1e-6)
     np.testing.assert_allclose(tally.lag_squares, [(1 + 4) / 2, (0.25 + 16) / 2], rtol=1e-6)
     assert [float(x) for x in tally[:5]] == [1, 1.25, 1, 0, 0]
     assert float(tally.lag_pairs) == 1
     np.testing.assert_allclose(latest.white, [1, 0.5], rtol=1e-6)
-    first, latest = sighted(sighting(accepted=False), yes, yes, seen())
+    first, latest = sighted(observation(accepted=False), yes, yes, seen())
     assert not np.any(first.lag_squares)
     assert (float(first.lag_pairs), float(first.accepted)) == (0, 0)
     assert bool(latest.seen)
     # Of one that could not be used nothing is scored, and the one before it stays the last.
-    for none in (sighting(S=np.zeros((2, 2)), nis=0.0), sighting(innovation=(np.nan, 0.1), nis=np.nan)):
+    for none in (observation(S=np.zeros((2, 2)), nis=0.0), observation(innovation=(np.nan, 0.1), nis=np.nan)):
         tally, latest = sighted(none, yes, no, seen((2.0, -4.0)))
         assert [float(x) for x in (*tally[:2], *tally[3:5], tally.lag_pairs)] == [0, 0, 1, 1, 0]
         assert [float(x) for x in latest.white] == [2, -4]
         assert not np.any(tally.lag_products)
-    empty, latest = sighted(sighting(S=np.zeros((2, 2)), nis=0.0, accepted=False), no, no, seen())
+    empty, latest = sighted(observation(S=np.zeros((2, 2)), nis=0.0, accepted=False), no, no, seen())
     assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves((empty, latest)))
 
 
@@ -99,7 +101,7 @@ def run(nees=3.0, count=8.0, lost=0.0, cov=1.0, lag=((1.0, -2.0), (2.0, 8.0))):
         phase_nees=jnp.array([2.0, 4.0, 6.0, 8.0]),
         lost=jnp.array(lost),
     )
-    sightings = scoring.no_sightings(zero)._replace(
+    sightings = scoring.no_observations(zero)._replace(
         observed=jnp.array(4.0),
         nis=jnp.array(6.0),
         lag_products=jnp.array(lag[0]),

@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 import reference
 import scipy.stats
+from drives import like
 
 from jaxlocmap import Config, Gaussian, GridSpec, se2, simulation
 from jaxlocmap._internal import random, trig
-from jaxlocmap.simulation import CAPSTONE, LOOP, Noise, Scenario
+from jaxlocmap.simulation import CAPSTONE, LOOP, Detector, Noise, Scenario
 from jaxlocmap.simulation.world import World, occupancy, ray_cast, room
 
 BOX = (4.5, 4.0, 7.5, 6.5)  # the box in the room: low x, low y, high x, high y, m
-SHORT = dataclasses.replace(CAPSTONE, name="short", steps=12, beams=5, sight_period=4)
+SHORT = like(CAPSTONE, name="short", steps=12, beams=5, detector=dict(period=4))
 FAILURE = 1e-6  # probability with which a statistical bound is missed by a right program
 
 draw_states = jax.jit(jax.vmap(simulation.draw_state, in_axes=(0, None)))
@@ -89,9 +90,9 @@ def test_given_the_course_s_random_numbers_the_drive_is_the_course_s(tolerance):
         room(),
         noise,
         jnp.array(CAPSTONE.start),
-        scenario=dataclasses.replace(CAPSTONE, sight_range=math.inf),
+        scenario=like(CAPSTONE, detector=dict(max_range=math.inf)),
     )
-    valid = np.asarray(inputs.valid & (inputs.z[..., 0] < CAPSTONE.sight_range))
+    valid = np.asarray(inputs.valid & (inputs.z[..., 0] < CAPSTONE.detector.max_range))
     exact = {"rtol": 0, "atol": tolerance(1e-10, 1e-4)}  # float32: rounding of 240 steps and of rays that graze a wall
     np.testing.assert_allclose(truth.pose, expected["truth"], **exact)
     np.testing.assert_allclose(inputs.control, expected["control"], **exact)
@@ -125,15 +126,12 @@ MADE_UP = Scenario(
     command=lambda k, pose: jnp.stack([1.0 + 0 * pose[0], 2.0 + 0 * pose[0]]),
     start=(1.0, 2.0, 3.0),
     prior_std=(0.1, 0.2, 0.3),
-    dt=0.25,
-    sight_range=2.5,
-    sight_period=3,
     beams=5,
     half_view=0.6,
-    max_range=3.0,
-    min_range=0.4,
-    grid=GridSpec((1.0, 2.0), 0.5, (3, 4)),
-    sensor_offset=(0.1, 0.2, 0.3),
+    detector=Detector(max_range=2.5, period=3),
+    robot=Config(
+        dt=0.25, max_range=3.0, min_range=0.4, grid=GridSpec((1.0, 2.0), 0.5, (3, 4)), sensor_offset=(0.1, 0.2, 0.3)
+    ),
 )
 
 
@@ -142,13 +140,13 @@ def test_a_scenario_of_other_numbers_is_what_it_says():
     np.testing.assert_allclose(MADE_UP.prior().mean, [1, 2, 3])
     np.testing.assert_allclose(MADE_UP.prior().cov, np.diag([0.01, 0.04, 0.09]), rtol=1e-6)
     np.testing.assert_allclose(MADE_UP.beam_angles(), [-0.6, -0.3, 0, 0.3, 0.6], rtol=0, atol=1e-7)
-    assert [bool(MADE_UP.looks(k)) for k in range(7)] == [True, False, False, True, False, False, True]
+    assert [bool(MADE_UP.detector.active(k)) for k in range(7)] == [True, False, False, True, False, False, True]
     expected = Config(
         dt=0.25,
         motion="euler",
         gate_probability=0.9,
         sensor_offset=(0.1, 0.2, 0.3),
-        grid=MADE_UP.grid,
+        grid=MADE_UP.robot.grid,
         min_range=0.4,
         max_range=3.0,
     )
@@ -260,7 +258,7 @@ def test_no_two_uses_of_a_step_share_a_random_number(monkeypatch):
         return counter
 
     monkeypatch.setattr(random, "threefry", recording)
-    words, scenario = (0, 0), dataclasses.replace(CAPSTONE, outliers=True)
+    words, scenario = (0, 0), like(CAPSTONE, detector=dict(outliers=True))
     for k in (0, 1, 2**20, 2**30):
         simulation.draw_drive(words, k, float)
         for j in range(30):
@@ -324,12 +322,12 @@ def test_the_noise_of_drive_and_sensors_is_what_the_equations_say(capstones, tol
     ]
     for sighting in sightings:
         assert_standard_normal(sighting[sure])
-        both = sure[:, : -CAPSTONE.sight_period] & sure[:, CAPSTONE.sight_period :]
-        assert_unrelated(sighting[:, : -CAPSTONE.sight_period][both], sighting[:, CAPSTONE.sight_period :][both])
+        both = sure[:, : -CAPSTONE.detector.period] & sure[:, CAPSTONE.detector.period :]
+        assert_unrelated(sighting[:, : -CAPSTONE.detector.period][both], sighting[:, CAPSTONE.detector.period :][both])
         both = sure[..., 3] & sure[..., 1]
         assert_unrelated(sighting[..., 3][both], sighting[..., 1][both])
     assert_unrelated(*(sighting[sure] for sighting in sightings))
-    edge = sure & (distance > CAPSTONE.sight_range - noise.range)
+    edge = sure & (distance > CAPSTONE.detector.max_range - noise.range)
     assert np.sum(edge) > 100
     assert_standard_normal(sightings[0][edge])
     cast = jax.jit(jax.vmap(lambda pose: ray_cast(pose, CAPSTONE.beam_angles(), room().segments, 8.0)))
@@ -356,20 +354,22 @@ def test_the_detector_looks_every_fifth_step_and_no_further_than_its_reach(capst
     assert not valid[:, ~looks].any()
     assert valid[:, looks].any(axis=(0, 2)).all()
     distance = np.linalg.norm(reference.COURSE_LANDMARKS - np.asarray(truth.pose, float)[:, :, None, :2], axis=-1)
-    close = np.abs(distance - CAPSTONE.sight_range) < tolerance(1e-12, 1e-5)
-    np.testing.assert_array_equal((valid | close)[:, looks], ((distance < CAPSTONE.sight_range) | close)[:, looks])
-    assert z[valid][:, 0].max() > CAPSTONE.sight_range  # measured, of a landmark that is nearer
+    close = np.abs(distance - CAPSTONE.detector.max_range) < tolerance(1e-12, 1e-5)
+    np.testing.assert_array_equal(
+        (valid | close)[:, looks], ((distance < CAPSTONE.detector.max_range) | close)[:, looks]
+    )
+    assert z[valid][:, 0].max() > CAPSTONE.detector.max_range  # measured, of a landmark that is nearer
 
 
 def test_every_finite_hit_lies_within_four_deviations_of_an_occupied_cell(capstones):
     # Between the exact hit, which is in an occupied cell, and the reading lies the beam's noise alone.
     truth, inputs = (jax.tree.map(lambda x: np.asarray(x[:2], np.float64), part) for part in capstones)
-    spec = CAPSTONE.grid
+    spec = CAPSTONE.robot.grid
     occupied = np.argwhere(np.asarray(jax.jit(occupancy, static_argnums=1)(room(), spec)))
     low = occupied[:, ::-1] * spec.resolution
     high = low + spec.resolution
     sigma = 0.03
-    hits = inputs.ranges < CAPSTONE.max_range - 5 * sigma  # a beam that met nothing reads 8 m plus noise
+    hits = inputs.ranges < CAPSTONE.robot.max_range - 5 * sigma  # a beam that met nothing reads 8 m plus noise
     angle = truth.pose[..., 2:] + reference.COURSE_ANGLES
     points = truth.pose[..., None, :2] + inputs.ranges[..., None] * np.stack([np.cos(angle), np.sin(angle)], -1)
     points = points[hits]
@@ -385,7 +385,7 @@ def test_every_finite_hit_lies_within_four_deviations_of_an_occupied_cell(capsto
 @pytest.mark.parametrize("offset", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.7), (-0.2, 0.4, -2.5)])
 def test_a_detector_off_the_centre_sees_from_where_it_sits(offset, tolerance):
     """Also how far: some landmarks within reach of the centre are beyond its own."""
-    scenario = dataclasses.replace(SHORT, sensor_offset=offset, sight_range=3.0)
+    scenario = like(SHORT, detector=dict(max_range=3.0), robot=dict(sensor_offset=offset))
     assert scenario.config().sensor_offset == offset
     pose, (dx, dy, dtheta) = np.array([1.0, -2.0, 0.9]), offset
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -406,7 +406,7 @@ def test_a_detector_at_the_centre_costs_nothing():
     def centred(draws, pose, landmark):
         dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
         distance = jnp.sqrt(dx * dx + dy * dy)
-        near = distance < SHORT.sight_range
+        near = distance < SHORT.detector.max_range
         reach = distance + Noise().range * draws[0]
         bearing = trig.arctan2(dy, dx) - pose[2] + Noise().bearing * draws[1]
         return jnp.stack([reach, se2.wrap(bearing)]), near
@@ -420,8 +420,13 @@ def test_a_detector_at_the_centre_costs_nothing():
 
 # --- Another robot than the course's ---
 
-OTHER = dataclasses.replace(
-    SHORT, name="other", steps=6, dt=0.25, sight_range=3.0, sight_period=3, half_view=0.4, max_range=2.0, min_range=0.3
+OTHER = like(
+    SHORT,
+    name="other",
+    steps=6,
+    half_view=0.4,
+    detector=dict(max_range=3.0, period=3),
+    robot=dict(dt=0.25, max_range=2.0, min_range=0.3),
 )
 
 
@@ -468,7 +473,7 @@ def test_a_landmark_at_the_very_reach_is_not_seen():
 def test_a_false_sighting_is_made_of_its_own_draws(drawn, false):
     """Anywhere within the robot's own reach, and all around; what is drawn decides whether it is one."""
     draws, noise = jnp.array([1.0, -1.0, drawn, 0.25, 0.875]), Noise(range=0.1, bearing=0.2, outlier_rate=0.3)
-    scenario = dataclasses.replace(OTHER, outliers=True)
+    scenario = like(OTHER, detector=dict(outliers=True))
     z, near = simulation.detect(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), noise, scenario=scenario)
     assert near
     np.testing.assert_allclose(z, [0.75, 0.75 * np.pi] if false else [2.1, -0.2], rtol=1e-6)
@@ -588,12 +593,12 @@ def test_many_keys_are_refused_by_name(keys):
 @pytest.mark.parametrize("offset", [(0.0, 0.0), (0.0, math.nan, 0.0)])
 def test_a_detector_that_sits_nowhere_is_refused(offset):
     with pytest.raises(ValueError, match=r"^sensor_offset: expected finite \(dx, dy, dtheta\), got "):
-        dataclasses.replace(SHORT, sensor_offset=offset)
+        like(SHORT, robot=dict(sensor_offset=offset))
 
 
 # --- Outliers ---
 
-FALSE = dataclasses.replace(SHORT, name="false", outliers=True)
+FALSE = like(SHORT, name="false", detector=dict(outliers=True))
 
 
 @functools.partial(jax.jit, static_argnames=("scenario", "count"))
@@ -613,7 +618,7 @@ def test_false_sightings_are_even_over_reach_and_bearing():
     """Whatever the landmark's own place is, and of one another."""
     z, valid = map(np.asarray, sighted(jnp.array(3.0), Noise(outlier_rate=1.0), scenario=FALSE, count=40_000))
     assert valid.all()
-    share = np.column_stack([z[:, 0] / FALSE.sight_range, (z[:, 1] / np.pi + 1) / 2]).astype(np.float64)
+    share = np.column_stack([z[:, 0] / FALSE.detector.max_range, (z[:, 1] / np.pi + 1) / 2]).astype(np.float64)
     for values in share.T:
         gap = scipy.stats.kstest(values, "uniform").statistic
         assert gap < np.sqrt(np.log(2 / FAILURE) / 2 / len(z))
@@ -652,7 +657,7 @@ def test_false_sightings_change_neither_the_drive_nor_what_is_true():
     close = functools.partial(np.testing.assert_allclose, rtol=0, atol=1e-5)
     jax.tree.map(close, (truth, honest.control, honest.ranges), (same_truth, some_false.control, some_false.ranges))
     jax.tree.map(close, honest, none_false)
-    looks = np.arange(SHORT.steps) % SHORT.sight_period == 0
+    looks = np.arange(SHORT.steps) % SHORT.detector.period == 0
     assert not some_false.valid[:, ~looks].any()
     np.testing.assert_array_equal(some_false.valid, honest.valid)
     same = np.all(np.abs(honest.z - some_false.z) < 1e-5, axis=-1)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import reference
 import scipy.stats
+from drives import like
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxlocmap import GridSpec, Params, init, run, simulation
@@ -26,16 +27,16 @@ from jaxlocmap.simulation import CAPSTONE, LOOP, Noise
 PLANT = {"v": 0.02, "w": math.hypot(0.01, 0.005 / 0.1), "range": 0.08, "bearing": 0.02}
 # A detector with a reach picks the short readings near its edge, and a gate throws out honest readings; without
 # either, what is left of the loop is a filter that is right but for its linearisation.
-HONEST = dataclasses.replace(LOOP, name="honest", sight_range=1e3)
+HONEST = like(LOOP, name="honest", detector=dict(max_range=1e3))
 HONEST_CONFIG = HONEST.config(motion="euler", gate_probability=None, grid=False)
-SHORT = dataclasses.replace(
+SHORT = like(
     CAPSTONE,
     name="short",
-    start=(6.0, 8.5, 0.5),  # in sight of all four landmarks
+    start=(6.0, 8.5, 0.5),
     steps=12,
     beams=9,
-    sight_period=2,
-    grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20)),
+    detector=dict(period=2),
+    robot=dict(grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20))),
 )
 PLAIN = {"xla_backend_optimization_level": 0}  # compiles in two thirds of the time, to slower programs
 ERRORS = 4  # standard errors a statistic may be off: a right program misses one in 16,000
@@ -222,7 +223,9 @@ def test_map_scores_are_there_only_with_a_grid(capstones, faulty):
 
 SHORT_CONFIG = SHORT.config(motion="euler")
 # Sightings that can be false, a sensor off the robot's centre, a filter of another period, and a gate that is a value.
-LIED = dataclasses.replace(LOOP, name="lied", steps=40, sight_period=3, outliers=True, sensor_offset=(0.1, -0.05, 0.03))
+LIED = like(
+    LOOP, name="lied", steps=40, detector=dict(period=3, outliers=True), robot=dict(sensor_offset=(0.1, -0.05, 0.03))
+)
 LIED_CONFIG = dataclasses.replace(LIED.config(gate_probability=None, grid=False), dt=0.2)
 
 
@@ -479,14 +482,14 @@ def test_the_totals_of_a_run_are_the_reference_s(faulty, tolerance):
         reference.euler,
         0.1,
     )
-    log_odds = np.zeros(SHORT.grid.shape)
-    how = {**reference.COURSE_SCAN, "resolution": SHORT.grid.resolution}
+    log_odds = np.zeros(SHORT.robot.grid.shape)
+    how = {**reference.COURSE_SCAN, "resolution": SHORT.robot.grid.resolution}
     for pose, ranges in zip(report["mean"], inputs.ranges, strict=True):
         log_odds = reference.update_scan(log_odds, pose, ranges, np.asarray(SHORT.beam_angles()), **how)
-    occupied = np.asarray(jax.jit(simulation.occupancy, static_argnums=1)(simulation.room(), SHORT.grid))
+    occupied = np.asarray(jax.jit(simulation.occupancy, static_argnums=1)(simulation.room(), SHORT.robot.grid))
     ok = np.ones(SHORT.steps, bool)
     expected = score(truth, inputs.valid, 0.99, ok, map_score(log_odds, occupied), **report)
-    assert expected.observed.sum() == 4 * SHORT.steps / SHORT.sight_period
+    assert expected.observed.sum() == 4 * SHORT.steps / SHORT.detector.period
     assert_same(of_run(faulty, 0), expected, tolerance(1e-9, 1e-2), tolerance(1e-12, 1e-4))
 
 
@@ -595,7 +598,7 @@ def test_a_reading_that_is_no_number_is_flagged_and_not_an_observation_of_distan
     report, healthy = faulty_report(faulty, "bearing"), faulty_report(faulty, "none")
     assert report["observations"] == 0
     assert report["unscored_observations"] == healthy["observations"]
-    assert report["flagged_steps"] == SHORT.steps / SHORT.sight_period
+    assert report["flagged_steps"] == SHORT.steps / SHORT.detector.period
     assert math.isnan(report["nis_mean"])
     both = faulty_report(faulty, "bearing", "none")
     assert both["nis_mean"] == healthy["nis_mean"]
@@ -682,7 +685,7 @@ def test_every_fault_is_counted_and_none_makes_the_study_no_number(faulty):
     assert report["runs"] == len(FAULTS)
     assert report["diverged_runs"] == faulty.diverged.sum() >= 2  # Q, heading, and the wild run if it ends far off
     assert report["unscored_steps"] == 2 * SHORT.steps  # Q, heading
-    assert report["flagged_steps"] >= 2 * SHORT.steps + SHORT.steps / SHORT.sight_period
+    assert report["flagged_steps"] >= 2 * SHORT.steps + SHORT.steps / SHORT.detector.period
     for name in ("anees", "nis_mean", "gate_accept_rate", "rmse_position_m", "rmse_yaw_rad", "coverage_95"):
         assert math.isfinite(report[name]), name
     assert all(map(math.isfinite, report["innovation_lag_one"].values()))

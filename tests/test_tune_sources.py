@@ -91,13 +91,13 @@ def test_a_map_is_tuned_and_judged_in_rooms_of_their_own(scene, monkeypatch):
     assert all(how["scans"] and how["worlds"] for _, how in scene.simulated.calls)
     rooms = [np.asarray(args[2]) for args, _ in scene.simulated.calls]
     assert len({room.tobytes() for batch in rooms for room in batch}) == 69
-    assert source.config.grid == simulation.CAPSTONE.grid
+    assert source.config.grid == simulation.CAPSTONE.robot.grid
     own, course = simulation.own_params(simulation.Noise(), 0.1), simulation.course_params()
     np.testing.assert_array_equal(source.start.R, own.R)  # a robot that knows its own noise
     assert (source.start.l_occ, source.start.l_free) == (course.l_occ, course.l_free)
     assert source.evidence(START) == {"anees": 3.0, "one_scan_ahead": {"log_loss": 0.5}}
     ((study, _, runs, *_), _) = scene.monte_carlo.calls[0]
-    assert (runs, study.config.grid) == (200, simulation.CAPSTONE.grid)
+    assert (runs, study.config.grid) == (200, simulation.CAPSTONE.robot.grid)
     assert scene.foresight.calls == [((START, "batch of 64", study.config), {})]
     both = tune_sources.from_scenario("capstone", "arc", 4, 10, wanted("map", "pose"))
     np.testing.assert_array_equal(both.start.R, course.R)

@@ -158,7 +158,7 @@ def _steps(span: jax.Array, n: jax.Array, exact: bool) -> Slopes | Spans:
     if not exact:
         return Spans(span, n)
     # The argument of the floor stays 1 / (4 n) away from every integer, more than a float32 product is off by.
-    share = 1 / n.astype(jnp.float32)
+    share = 1 / n.astype(jnp.float32)[None]
     return Slopes(span.astype(jnp.float32) * share, 0.5 - 0.25 * share * jnp.sign(span).astype(jnp.float32))
 
 

@@ -137,11 +137,11 @@ class Checkpoint:
         if not self.resume or found is None:
             self._discard(found)
             self._write(
-                _MANIFEST, json.dumps({"made by": _MARK, "digest": _owndigest(asked), **asked}, indent=1).encode()
+                _MANIFEST, json.dumps({"made by": _MARK, "digest": _own_digest(asked), **asked}, indent=1).encode()
             )
         self._manifest = asked
         whole = {part for part in parts if self._is_whole(part)}
-        self.runs_kept = sum(map(self._split(asked).runs_of, whole))
+        self.runs_kept = sum(map(self._plan(asked).runs_of, whole))
         return whole
 
     def save(self, part: int, arrays: Sequence[np.ndarray]) -> None:
@@ -160,7 +160,7 @@ class Checkpoint:
                 f"parts: expected to keep part {part} in {self.folder}, got: {error.strerror}; "
                 f"{self.runs_kept} finished runs are kept there"
             ) from error
-        self.runs_kept += self._split(self._manifest).runs_of(part)
+        self.runs_kept += self._plan(self._manifest).runs_of(part)
 
     def load(self, part: int) -> tuple[np.ndarray, ...]:
         """The arrays of a finished part.
@@ -215,7 +215,7 @@ class Checkpoint:
         """The manifest in the folder; None if there is none, or none that can be believed."""
         try:
             found = json.loads(files.read(self.folder / _MANIFEST, most=_LARGEST_MANIFEST))
-            if found.pop("made by") == _MARK and found.pop("digest") == _owndigest(found):
+            if found.pop("made by") == _MARK and found.pop("digest") == _own_digest(found):
                 return found if all(type(found[name]) is int and found[name] > 0 for name in Plan._fields) else None
         except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             pass
@@ -225,7 +225,7 @@ class Checkpoint:
         return json.loads(json.dumps({**self.settings, **manifest}))  # as it will be read again
 
     @staticmethod
-    def _split(manifest: Mapping[str, Any]) -> Plan:
+    def _plan(manifest: Mapping[str, Any]) -> Plan:
         return Plan(manifest["runs"], manifest["chunk"])
 
     def _discard(self, found: dict[str, Any] | None) -> None:
@@ -239,15 +239,15 @@ class Checkpoint:
 
     def _named(self, manifest: Mapping[str, Any] | None) -> list[Path]:
         """The files of all parts of a study, there or not; none without a manifest."""
-        return [] if manifest is None else [self.folder / _name(part) for part in range(self._split(manifest).parts)]
+        return [] if manifest is None else [self.folder / _name(part) for part in range(self._plan(manifest).parts)]
 
     def _part_files(self) -> list[Path]:
         """Files that are named like parts."""
         return [file for part in range(MOST_PARTS) if (file := self.folder / _name(part)).exists()]
 
     def _runs_there(self, manifest: Mapping[str, Any]) -> int:
-        split = self._split(manifest)
-        return sum(split.runs_of(part) for part in range(split.parts) if (self.folder / _name(part)).exists())
+        plan = self._plan(manifest)
+        return sum(plan.runs_of(part) for part in range(plan.parts) if (self.folder / _name(part)).exists())
 
     def _is_whole(self, part: int) -> bool:
         try:
@@ -283,7 +283,7 @@ def _name(part: int) -> str:
     return f"part-{part:03d}"
 
 
-def _owndigest(study: Mapping[str, Any]) -> str:
+def _own_digest(study: Mapping[str, Any]) -> str:
     return digest(json.dumps(study, sort_keys=True).encode())
 
 
