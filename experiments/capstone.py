@@ -74,7 +74,8 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
         error = jax.vmap(consistency.pose_error)(truth.pose, info.belief.mean)
         nees = jax.vmap(consistency.nees)(error, info.belief.cov)
         log_odds, spec = state.log_odds, settings.grid
-        assert log_odds is not None and spec is not None  # the scenario has a grid
+        assert log_odds is not None  # the scenario has a grid
+        assert spec is not None
         occupancy = grid.probability(log_odds)
         occupied = simulation.occupancy(world, spec)
         report = {

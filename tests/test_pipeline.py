@@ -890,9 +890,13 @@ def refused(course, error, message, *, config=SCANNING, params=None, **fields):
     arguments = {"landmarks": course.landmarks, "beam_angles": course.beam_angles}
     for name in arguments.keys() & fields.keys():
         arguments[name] = fields.pop(name)
-    with pytest.raises(error, match=message):
+
+    def start_and_run():
         state = init(course.prior, config=config)
         run(params or course.params, state, inputs._replace(**fields), config=config, **arguments)
+
+    with pytest.raises(error, match=message):
+        start_and_run()
 
 
 @pytest.mark.parametrize(

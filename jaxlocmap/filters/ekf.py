@@ -65,9 +65,7 @@ def _chi2_quantile(probability: jax.Array, dimension: int) -> jax.Array:
     p = jnp.clip(probability, 1e-12, 1 - jnp.finfo(probability.dtype).epsneg)
     half, spread = dimension / 2, 2 / (9 * dimension)
     x = dimension * (1 - spread + jax.scipy.special.ndtri(p) * math.sqrt(spread)) ** 3  # Wilson & Hilferty 1931
-    x = jnp.maximum(
-        x, 2 * (p * math.gamma(half + 1)) ** (1 / half)
-    )  # the quantile is above what its series begins with
+    x = jnp.maximum(x, 2 * (p * math.gamma(half + 1)) ** (1 / half))  # the first term of the series
     for _ in range(6):  # Newton's steps, in the logarithm so that none leaves x > 0
         density = jnp.exp((half - 1) * jnp.log(x / 2) - x / 2 - math.lgamma(half)) / 2
         x = x * jnp.exp(-(jax.scipy.special.gammainc(half, x / 2) - p) / (density * x))
