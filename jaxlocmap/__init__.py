@@ -1,13 +1,16 @@
 """Localisation and mapping whose covariance can be believed, or shown not to be: a pure-functional JAX library."""
 
-from jaxlocmap import consistency, motion, sensors, simulation
+from jaxlocmap import consistency, motion, parameters, sensors, simulation
 from jaxlocmap.filters import ekf
 from jaxlocmap.mapping import grid
 from jaxlocmap.motion import MotionModel
+from jaxlocmap.parameters import Block, Params
 from jaxlocmap.pipeline import init, map_scans, run, step
-from jaxlocmap.types import Config, Gaussian, GridSpec, Info, Inputs, Params, State, Truth
+from jaxlocmap.sensors import Sensor
+from jaxlocmap.types import Config, Gaussian, GridSpec, Info, Inputs, Scanner, State, Truth
 
 __all__ = [
+    "Block",
     "Config",
     "Gaussian",
     "GridSpec",
@@ -15,6 +18,8 @@ __all__ = [
     "Inputs",
     "MotionModel",
     "Params",
+    "Scanner",
+    "Sensor",
     "State",
     "Truth",
     "consistency",
@@ -23,6 +28,7 @@ __all__ = [
     "init",
     "map_scans",
     "motion",
+    "parameters",
     "run",
     "sensors",
     "simulation",
