@@ -135,10 +135,10 @@ def _poses(truth: Any, mean: Any, cov: Any, valid: Any, pose: tuple[int, int, in
         truth, mean, cov = truth[None], mean[None], cov[None]
         valid = None if valid is None else np.asarray(valid)[None]
     runs, steps, size = mean.shape
-    if len(pose) != 3 or len(set(pose)) != 3 or not all(0 <= i < size for i in pose):
+    if len(pose) != POSE or len(set(pose)) != POSE or not all(0 <= i < size for i in pose):
         raise ValueError(f"pose: expected three different entries of a state of {size}, got {pose}")
     checks.shape("cov", cov, (runs, steps, size, size))
-    if truth.shape != (runs, steps, 3):
+    if truth.shape != (runs, steps, POSE):
         checks.shape("truth", truth, (runs, steps, size))
         truth = truth[..., list(pose)]
     valid = np.ones((runs, steps), bool) if valid is None else np.asarray(valid)
@@ -201,8 +201,8 @@ def _means(nees: np.ndarray, axis: np.ndarray, diverged: np.ndarray, time: np.nd
     means = PoseMeans(
         nees=whole,
         undiverged_nees=average(nees[kept], POSE),
-        axis_nees=tuple(average(axis[kept, :, i], 1) for i in range(3)),
-        within_two_sigma=tuple(shares(axis[..., i] <= 4, WITHIN_TWO_SIGMA) for i in range(3)),
+        axis_nees=tuple(average(axis[kept, :, i], 1) for i in range(POSE)),
+        within_two_sigma=tuple(shares(axis[..., i] <= 4, WITHIN_TWO_SIGMA) for i in range(POSE)),
         covered=tuple(shares(nees < chi2_quantile(level, POSE), level) for level in COVERAGE_LEVELS),
         phases=tuple(_phase(nees[kept], span, whole) for span in spans),
         phase_spans=tuple((float(time[span.start]), float(time[span.stop - 1])) for span in spans),

@@ -144,9 +144,9 @@ def phase_edges(steps: int) -> list[int]:
 
 def no_steps(dtype: Any, *, whole_state: bool) -> StepTally:
     """The tally before the first step. whole_state: more than the pose is scored."""
-    zero, three = jnp.zeros((), dtype), jnp.zeros(POSE, dtype)
+    zero, axes = jnp.zeros((), dtype), jnp.zeros(POSE, dtype)
     levels, state = jnp.zeros(len(statistics.COVERAGE_LEVELS), dtype), zero if whole_state else None
-    return StepTally(zero, zero, three, three, levels, jnp.zeros(PHASES, dtype), zero, zero, state, state)
+    return StepTally(zero, zero, axes, axes, levels, jnp.zeros(PHASES, dtype), zero, zero, state, state)
 
 
 def no_observations(dtype: Any, dim: int) -> ObservationTally:

@@ -92,9 +92,9 @@ def score_pose(truth: jax.Array, mean: jax.Array, cov: jax.Array) -> PoseScore:
     error = pose_error(truth, mean)
     distance = nees(error, cov)
     scored = jnp.isfinite(distance)
-    square = [jnp.where(scored, error[i] ** 2, 0) for i in range(3)]
-    variance = [jnp.where(scored, cov[i, i], 0) for i in range(3)]
-    ratio = [jnp.where(scored, square[i] / cov[i, i], 0) for i in range(3)]
+    square = [jnp.where(scored, error[i] ** 2, 0) for i in range(POSE)]
+    variance = [jnp.where(scored, cov[i, i], 0) for i in range(POSE)]
+    ratio = [jnp.where(scored, square[i] / cov[i, i], 0) for i in range(POSE)]
     surprising = distance > chi2_quantile(1 - _DIVERGED_TAIL, POSE)
     diverged = scored & (square[0] + square[1] > _DIVERGED_DISTANCE**2) & surprising
     return PoseScore(scored, jnp.where(scored, distance, 0), tuple(square), tuple(variance), tuple(ratio), diverged)

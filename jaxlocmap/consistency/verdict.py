@@ -138,7 +138,7 @@ def _relative(mean: Mean, reference: Mean | None, expected: float) -> Mean:
 
 
 def _axes(means: PoseMeans, basis: Basis) -> list[Mean]:
-    reference = basis.reference.axis_nees if basis.reference is not None else (None,) * 3
+    reference = basis.reference.axis_nees if basis.reference is not None else (None,) * POSE
     return [_relative(*pair, 1) for pair in zip(means.axis_nees, reference, strict=True)]
 
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxlocmap import checks
 from jaxlocmap._internal.batching import any_in_batch, at_once, cond
 from jaxlocmap.mapping.rays import Rays, flat_cells, longest_crossing, on_map, trace
-from jaxlocmap.se2 import compose
+from jaxlocmap.se2 import POSE, compose
 from jaxlocmap.types import GridSpec, Scanner
 
 
@@ -186,7 +186,7 @@ def endpoint_covariance(
     Raises:
         ValueError: a wrong shape.
     """
-    checks.shapes(pose=(pose, (3,)), cov=(cov, (3, 3)), reach=(reach, ()), angle=(angle, ()))
+    checks.shapes(pose=(pose, (POSE,)), cov=(cov, (POSE, POSE)), reach=(reach, ()), angle=(angle, ()))
     if R is not None:
         checks.shape("R", R, (2, 2))
     c, s = jnp.cos(pose[2] + angle), jnp.sin(pose[2] + angle)
