@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drives import like
+from drives import with_detector
 
 from jaxlocmap import Params, plotting, simulation
 from jaxlocmap.consistency.study import Study, summarise
@@ -21,7 +21,9 @@ sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import sweep
 
 # In sight of all four landmarks, which the detector looks for in every second step; it can be lied to.
-SHORT = like(simulation.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12, detector=dict(period=2, outliers=True))
+SHORT = with_detector(
+    dataclasses.replace(simulation.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12), period=2, outliers=True
+)
 RUNS, RATES, GATES = 16, (0.0, 0.3, 0.6), (0.9, 1.0)
 Q, R = np.diag([0.02**2, 0.051**2]), np.diag([0.08**2, 0.02**2])
 
@@ -43,9 +45,9 @@ ENTERED = {
 class Stub:
     """In the place of a study: hands back what it was given."""
 
-    def __call__(self, key, params, world, noise, prior, gate_probability=None):
+    def __call__(self, key, params, world, noise, prior):
         del key, world, prior
-        gate = jnp.zeros(()) if gate_probability is None else gate_probability
+        gate = jnp.zeros(()) if params.gate_probability is None else params.gate_probability
         return {"Q": params.Q, "R": params.R, "rate": jnp.asarray(noise.outlier_rate, float), "gate": gate}
 
 
@@ -130,7 +132,8 @@ def alone(rate, gate):
     """A study of one cell."""
     params, world, noise, prior = shared()
     noise = noise._replace(outlier_rate=jnp.asarray(rate, float))
-    arguments = (params, world, noise, prior, jnp.asarray(gate, float))
+    params = params._replace(gate_probability=jnp.asarray(gate, float))
+    arguments = (params, world, noise, prior)
     return monte_carlo(Study(SHORT, settings()), jax.random.key(0), RUNS, *arguments).value
 
 

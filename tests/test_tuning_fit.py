@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 import scipy.optimize
-from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
+from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, with_detector
 from jax.flatten_util import ravel_pytree
 
 from jaxlocmap import Gaussian, Params, simulation, tuning
@@ -23,7 +23,7 @@ def test_it_finds_the_robots_own_noise(x64):
     times that, and 2 % for readings that are false but near enough to be half believed. The yaw rate shows up in few of
     so short drives.
     """
-    lying = like(SHORT, name="lying", steps=40, detector=dict(outliers=True))
+    lying = with_detector(dataclasses.replace(SHORT, name="lying", steps=40), outliers=True)
     noise = simulation.Noise(outlier_rate=0.05)
     batch = tuning.simulated(jax.random.key(4), 400, simulation.room(), noise, scenario=lying)
     soft = dataclasses.replace(ONLY_POSES, gate_temperature=2.0)
@@ -227,7 +227,7 @@ def test_two_equations_do_not_tell_three_parameters(losses):
     objective.check_tuned(("v", "range", "l_occ", "l_free"))
 
 
-@pytest.mark.parametrize("losses", [("nees", "pose"), ("nis", "innovation"), ("nees", "nis", "state"), ("map",)])
+@pytest.mark.parametrize("losses", [("nees", "pose_nll"), ("nis", "innovation_nll"), ("nees", "nis", "mse"), ("map",)])
 def test_beside_another_loss_they_may(losses):
     tuning.Objective(CONFIG, tuple((name, 1.0) for name in losses)).check_tuned(tuning.NAMES)
 
