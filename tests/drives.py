@@ -8,23 +8,22 @@ import jax
 from jaxlocmap import GridSpec, simulation, tuning
 
 
-def with_robot(scenario, **changes):
-    """The scenario with other settings of its robot."""
-    return dataclasses.replace(scenario, robot=dataclasses.replace(scenario.robot, **changes))
+def like(scenario, *, detector=None, robot=None, **changes):
+    """A scenario with some fields changed, of its detector and its robot too."""
+    detector = dataclasses.replace(scenario.detector, **(detector or {}))
+    robot = dataclasses.replace(scenario.robot, **(robot or {}))
+    return dataclasses.replace(scenario, detector=detector, robot=robot, **changes)
 
 
-def with_detector(scenario, **changes):
-    """The scenario with another detector of landmarks."""
-    return dataclasses.replace(scenario, detector=dataclasses.replace(scenario.detector, **changes))
-
-
-# In sight of all four landmarks, which the detector looks for in every second step.
-SHORT = with_detector(
-    with_robot(
-        dataclasses.replace(simulation.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12, beams=9),
-        grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20)),
-    ),
-    period=2,
+# In sight of all four landmarks, which the detector reports in every second step.
+SHORT = like(
+    simulation.CAPSTONE,
+    name="short",
+    start=(6.0, 8.5, 0.5),
+    steps=12,
+    beams=9,
+    detector=dict(period=2),
+    robot=dict(grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20))),
 )
 OWN = simulation.own_params(simulation.Noise(), SHORT)
 CONFIG = SHORT.config(motion="euler", gate_probability=0.9999)

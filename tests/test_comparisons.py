@@ -219,7 +219,13 @@ def test_losses_are_compared_from_a_start_three_times_too_sure(monkeypatch, fits
         np.testing.assert_allclose(getattr(told, name), getattr(own, name), rtol=1e-6)
         np.testing.assert_allclose(getattr(start, name), np.asarray(getattr(own, name)) / 9, rtol=1e-6)
     assert [args[0] for args, _ in judged.calls[2:]] == [A] * (1 if quick else 5)
-    words = ["the start", "the robot's own noise", "tuned for `mse`", "tuned for `pose_nll`", "tuned for `innovation_nll`"]
+    words = [
+        "the start",
+        "the robot's own noise",
+        "tuned for `mse`",
+        "tuned for `pose_nll`",
+        "tuned for `innovation_nll`",
+    ]
     words += [f"tuned for `{name}`, range and bearing alone" for name in ("nees", "nis")]
     assert [row["filter"] for row in rows] == words[: len(rows)]
     assert len(rows) == (3 if quick else 7)
@@ -470,7 +476,11 @@ def test_means_over_robots_and_over_splits():
             "after": {"anees": after},
         }
 
-    rows = [row("pose_nll", True, 9.0, 3.0, 0.1), row("pose_nll", True, 7.0, 2.0, 0.2), row("pose_nll", False, 1.0, 1.0, 1.0)]
+    rows = [
+        row("pose_nll", True, 9.0, 3.0, 0.1),
+        row("pose_nll", True, 7.0, 2.0, 0.2),
+        row("pose_nll", False, 1.0, 1.0, 1.0),
+    ]
     rows += [row("innovation_nll", True, 4.0, 6.0, 0.5)]
     pose, innovation = tune_robots._summaries(rows)
     assert pose == {
@@ -515,7 +525,9 @@ def test_the_table_of_robots_has_a_start_for_each_log():
 @pytest.mark.parametrize("write", [False, True])
 def test_the_program_of_robots(monkeypatch, tmp_path, write):
     monkeypatch.setattr(tune_robots.hosts, "use_all_cores", Recorder())
-    monkeypatch.setattr(tune_robots, "_jobs", lambda config: [("mrclam 1", "pose_nll", lambda: "source"), ("w", "p", dict)])
+    monkeypatch.setattr(
+        tune_robots, "_jobs", lambda config: [("mrclam 1", "pose_nll", lambda: "source"), ("w", "p", dict)]
+    )
     monkeypatch.setattr(
         tune_robots,
         "_tuned",

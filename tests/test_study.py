@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import reference
 import scipy.stats
-from drives import SHORT, with_detector, with_robot
+from drives import SHORT, like
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxlocmap import Params, init, run, sensors, simulation
@@ -27,7 +27,7 @@ from jaxlocmap.simulation import CAPSTONE, LOOP, Noise
 PLANT = {"v": 0.02, "w": math.hypot(0.01, 0.005 / 0.1), "range": 0.08, "bearing": 0.02}
 # A detector with a reach picks the short readings near its edge, and a gate throws out honest readings; without
 # either, what is left of the loop is a filter that is right but for its linearisation.
-HONEST = with_detector(dataclasses.replace(LOOP, name="honest"), max_range=1e3)
+HONEST = like(LOOP, name="honest", detector=dict(max_range=1e3))
 HONEST_CONFIG = HONEST.config(motion="euler", gate_probability=None, grid=False)
 PLAIN = {"xla_backend_optimization_level": 0}  # compiles in two thirds of the time, to slower programs
 ERRORS = 4  # standard errors a statistic may be off: a right program misses one in 16,000
@@ -214,8 +214,13 @@ def test_map_scores_are_there_only_with_a_grid(capstones, faulty):
 
 SHORT_CONFIG = SHORT.config(motion="euler")
 # Sightings that can be false, a sensor off the robot's centre, another period, and a gate that is a value.
-LIED = with_detector(dataclasses.replace(LOOP, name="lied", steps=40), period=3, outliers=True)
-LIED = with_robot(LIED, dt=0.2, sensor_offset=(0.1, -0.05, 0.03))
+LIED = like(
+    LOOP,
+    name="lied",
+    steps=40,
+    detector=dict(period=3, outliers=True),
+    robot=dict(dt=0.2, sensor_offset=(0.1, -0.05, 0.03)),
+)
 LIED_CONFIG = LIED.config(gate_probability=None, grid=False)
 
 

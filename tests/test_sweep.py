@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drives import with_detector
+from drives import like
 
 from jaxlocmap import Params, plotting, simulation
 from jaxlocmap.consistency.study import Study, summarise
@@ -21,9 +21,7 @@ sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import sweep
 
 # In sight of all four landmarks, which the detector looks for in every second step; it can be lied to.
-SHORT = with_detector(
-    dataclasses.replace(simulation.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12), period=2, outliers=True
-)
+SHORT = like(simulation.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12, detector=dict(period=2, outliers=True))
 RUNS, RATES, GATES = 16, (0.0, 0.3, 0.6), (0.9, 1.0)
 Q, R = np.diag([0.02**2, 0.051**2]), np.diag([0.08**2, 0.02**2])
 

@@ -57,7 +57,9 @@ def test_simulated_drives(tmp_path):
 
 def test_ctrl_c_while_judging_stops_at_once_and_says_what_is_kept(monkeypatch, tmp_path):
     trace = Trace(*np.zeros((4, 4)), params={"range": np.ones(4)})
-    found = tuning.Fit(simulation.own_params(simulation.Noise(), simulation.CAPSTONE), 1.0, np.ones(3), trace, 0, False, 0.0, 0.0)
+    found = tuning.Fit(
+        simulation.own_params(simulation.Noise(), simulation.CAPSTONE), 1.0, np.ones(3), trace, 0, False, 0.0, 0.0
+    )
     source = tune.Source("made", found.params, Config(dt=0.1), *[None] * 3, None, 0.1)
     monkeypatch.setattr(tune, "_source", lambda *_: source)
 

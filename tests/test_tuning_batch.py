@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drives import ONLY_POSES, OWN, SHORT, drives, with_robot
+from drives import ONLY_POSES, OWN, SHORT, drives, like
 
 from jaxlocmap import Gaussian, Inputs, simulation, tuning
 from jaxlocmap.simulation.world import random_room
@@ -270,7 +270,7 @@ def test_simulated_drives_hang_on_all_of_their_key_and_each_on_its_own():
 
 def test_a_start_that_is_not_exact_is_drawn_from_the_prior_with_half_of_the_run_s_key():
     """One step of no time to speak of; of the heading there is noise of its own."""
-    still = with_robot(dataclasses.replace(SHORT, name="still", steps=1, exact_prior=False), dt=1e-9)
+    still = like(SHORT, name="still", steps=1, exact_prior=False, robot=dict(dt=1e-9))
     batch = tuning.simulated(jax.random.key(5), 8, simulation.room(), simulation.Noise(), scenario=still)
     draw = jax.jit(
         jax.vmap(lambda key, prior: simulation.draw_state(jax.random.split(key)[0], prior), in_axes=(0, None))

@@ -9,10 +9,11 @@ import numpy as np
 import optax
 import pytest
 import scipy.optimize
-from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, with_detector
+from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
 from jax.flatten_util import ravel_pytree
 
 from jaxlocmap import Gaussian, Params, simulation, tuning
+from jaxlocmap.tuning.parameters import BLOCKS
 
 OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation_nll", 1.0),))
 START = simulation.course_params()
@@ -23,7 +24,7 @@ def test_it_finds_the_robots_own_noise(x64):
     times that, and 2 % for readings that are false but near enough to be half believed. The yaw rate shows up in few of
     so short drives.
     """
-    lying = with_detector(dataclasses.replace(SHORT, name="lying", steps=40), outliers=True)
+    lying = like(SHORT, name="lying", steps=40, detector=dict(outliers=True))
     noise = simulation.Noise(outlier_rate=0.05)
     batch = tuning.simulated(jax.random.key(4), 400, simulation.room(), noise, scenario=lying)
     soft = dataclasses.replace(ONLY_POSES, gate_temperature=2.0)
@@ -98,6 +99,8 @@ class Bowl:
     """In place of an objective: Σ (log range)² · weight over the sequences, whose weights are in the prior's mean. What
     is judged may be told beforehand.
     """
+
+    blocks = BLOCKS
 
     def __init__(self, told=()):
         self.told, self.asked = list(told), []

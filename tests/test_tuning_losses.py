@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, with_detector
+from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
 
 from jaxlocmap import Params, simulation, tuning
 from jaxlocmap.mapping.predictive import PredictiveScore
@@ -171,7 +171,7 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     """Over 2 % of a deviation to either side the loss changes as much as its slopes add up to, though false readings
     pass in and out; behind a gate that decides, it does not.
     """
-    lying = with_detector(dataclasses.replace(SHORT, name="lying", steps=60), outliers=True)
+    lying = like(SHORT, name="lying", steps=60, detector=dict(outliers=True))
     batch = tuning.simulated(
         jax.random.key(2), 64, simulation.room(), simulation.Noise(outlier_rate=0.1), scenario=lying
     )
