@@ -309,7 +309,8 @@ def test_a_start_that_is_not_finite():
     covs[2] = -np.eye(3)
     prior = drives().prior._replace(cov=jnp.asarray(covs))
     refused(
-        "loss `pose_nll`: expected a finite value at the start, got none for 1 of 4 sequences, the first being number 2",
+        "loss `pose_nll`: expected a finite value at the start, got none for 1 of 4 sequences, the first being "
+        "number 2",
         (("pose_nll", 1.0),),
         prior=prior,
     )
