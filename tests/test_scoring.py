@@ -1,6 +1,5 @@
 """What one run adds to a study, from steps and observations made up by hand."""
 
-
 import jax
 import jax.numpy as jnp
 import numpy as np
