@@ -54,7 +54,7 @@ def test_a_study_gets_every_option_of_the_computing(monkeypatch, tmp_path):
     assert common.study("one run", "key", 11, "params", "world", config=config, checkpoint=kept) == "result"
     ((args, how),) = ran.calls
     assert args == ("one run", "key", 11, "params", "world")
-    assert (how["chunk"], how["devices"], how["parts"]) == (7, ["a", "b"], kept)
+    assert (how["chunk"], how["devices"], how["checkpoint"]) == (7, ["a", "b"], kept)
 
 
 def test_a_speed_counts_the_runs_of_this_time_alone(monkeypatch):

@@ -213,18 +213,24 @@ def test_losses_are_compared_from_a_start_three_times_too_sure(monkeypatch, fits
     judged = Recorder({name: 1.0 for name in ("rmse_position_m", "rmse_yaw_rad", "anees", "nis_mean", "coverage_95")})
     monkeypatch.setattr(tune_compare, "_drives", lambda *args: args)
     rows = tune_compare._losses(8, judged, tune_compare.CompareConfig(seed=5, quick=quick))
-    own = simulation.own_params(simulation.Noise(), 0.1)
+    own = simulation.own_params(simulation.Noise(), simulation.CAPSTONE)
     (start,), (told,) = (args for args, _ in judged.calls[:2])
     for name in ("Q", "R"):
         np.testing.assert_allclose(getattr(told, name), getattr(own, name), rtol=1e-6)
         np.testing.assert_allclose(getattr(start, name), np.asarray(getattr(own, name)) / 9, rtol=1e-6)
     assert [args[0] for args, _ in judged.calls[2:]] == [A] * (1 if quick else 5)
-    words = ["the start", "the robot's own noise", "tuned for `state`", "tuned for `pose`", "tuned for `innovation`"]
+    words = [
+        "the start",
+        "the robot's own noise",
+        "tuned for `mse`",
+        "tuned for `pose_nll`",
+        "tuned for `innovation_nll`",
+    ]
     words += [f"tuned for `{name}`, range and bearing alone" for name in ("nees", "nis")]
     assert [row["filter"] for row in rows] == words[: len(rows)]
     assert len(rows) == (3 if quick else 7)
     for ((objective, begun, batch), how), name in zip(
-        fits.calls, ("state", "pose", "innovation", "nees", "nis"), strict=False
+        fits.calls, ("mse", "pose_nll", "innovation_nll", "nees", "nis"), strict=False
     ):
         assert (objective.weights, begun, batch) == (((name, 1.0),), start, (simulation.LOOP, 8, 5))
         tuned = ("range", "bearing") if name in ("nees", "nis") else tuning.NOISE
@@ -334,7 +340,7 @@ def test_what_the_linear_robot_is_tuned_by(monkeypatch, fits, quick, installed):
     monkeypatch.setattr(tune_compare, "_okf", Recorder((B, 7.0)))
     monkeypatch.setattr(tune_compare.importlib.util, "find_spec", lambda name: installed or None)
     rows = tune_compare._linear(tune_compare.CompareConfig(seed=5, quick=quick))
-    losses = ["state"] if quick else ["state", "pose", "innovation"]
+    losses = ["mse"] if quick else ["mse", "pose_nll", "innovation_nll"]
     assert rows == ["the start", *(f"this library, `{n}`" for n in losses)] + ["OKF, squared error"] * installed
     (rng, count, steps), (_, more, _) = (args for args, _ in drives.calls)
     assert (count, more, steps) == ((10, 40, 10) if quick else (100, 400, 60))
@@ -414,8 +420,8 @@ def jobs(monkeypatch, **options):
 def test_robots_are_tuned_loss_by_loss_and_split_by_split(monkeypatch):
     made = jobs(monkeypatch, splits=2, seed=4)
     assert [(what, loss) for what, loss, _ in made] == [
-        *(("woods", loss) for loss in ("innovation_nll", "state", "nees", "pose")),
-        *((f"mrclam {rest}", loss) for loss in ("innovation_nll", "pose") for rest in ("4, 5", "3, 5")),
+        *(("woods", loss) for loss in ("innovation_nll", "mse", "nees", "pose_nll")),
+        *((f"mrclam {rest}", loss) for loss in ("innovation_nll", "pose_nll") for rest in ("4, 5", "3, 5")),
         ("intel", "map"),
     ]
     for _, loss, args in made:
@@ -436,14 +442,14 @@ def test_robots_are_tuned_loss_by_loss_and_split_by_split(monkeypatch):
 
 def test_a_quick_run_of_the_robots_is_short(monkeypatch):
     made = jobs(monkeypatch, quick=True)
-    assert [(what, loss) for what, loss, _ in made] == [("woods", "pose"), ("intel", "map")]
+    assert [(what, loss) for what, loss, _ in made] == [("woods", "pose_nll"), ("intel", "map")]
     assert made[1][2][1] == 0.2
     assert all(args[-1].quick for *_, args in made)
 
 
 @pytest.mark.parametrize(
     ("loss", "tuned"),
-    [("pose", tuning.NOISE), ("map", tuning.SENSOR_MODEL), ("nees", ("range", "bearing"))],
+    [("pose_nll", tuning.NOISE), ("map", tuning.SENSOR_MODEL), ("nees", ("range", "bearing"))],
 )
 @pytest.mark.parametrize(("quick", "epochs"), [(False, 20), (True, 1)])
 def test_a_log_is_tuned_and_judged(fits, loss, tuned, quick, epochs):
@@ -470,12 +476,16 @@ def test_means_over_robots_and_over_splits():
             "after": {"anees": after},
         }
 
-    rows = [row("pose", True, 9.0, 3.0, 0.1), row("pose", True, 7.0, 2.0, 0.2), row("pose", False, 1.0, 1.0, 1.0)]
+    rows = [
+        row("pose_nll", True, 9.0, 3.0, 0.1),
+        row("pose_nll", True, 7.0, 2.0, 0.2),
+        row("pose_nll", False, 1.0, 1.0, 1.0),
+    ]
     rows += [row("innovation_nll", True, 4.0, 6.0, 0.5)]
     pose, innovation = tune_robots._summaries(rows)
     assert pose == {
         "log": "mrclam, two robots of five, 2 splits",
-        "loss": "pose",
+        "loss": "pose_nll",
         "one_of_many": False,
         "params": {"v": pytest.approx(0.15)},
         "before": {"anees": 8.0},
@@ -492,8 +502,8 @@ def test_the_table_of_robots_has_a_start_for_each_log():
     before = values(0.5, 30.0, 0.2)
     rows = [
         {"log": "woods", "loss": "nees", "before": before, "after": values(0.25, 3.0, 0.951)},
-        {"log": "woods", "loss": "pose", "before": before, "after": values(0.125, 2.5, 0.9)},
-        {"log": "m", "loss": "pose", "before": before, "after": values(1, 2, 1), "anees_of_splits": [1.5, 4.0]},
+        {"log": "woods", "loss": "pose_nll", "before": before, "after": values(0.125, 2.5, 0.9)},
+        {"log": "m", "loss": "pose_nll", "before": before, "after": values(1, 2, 1), "anees_of_splits": [1.5, 4.0]},
         {
             "log": "intel",
             "loss": "map",
@@ -505,9 +515,9 @@ def test_the_table_of_robots_has_a_start_for_each_log():
     assert rows_of(poses) == [
         ["woods", "–", "0.500 m", "30", "20.0 %"],
         ["woods", "`nees`", "0.250 m", "3", "95.1 %"],
-        ["woods", "`pose`", "0.125 m", "2.5", "90.0 %"],
+        ["woods", "`pose_nll`", "0.125 m", "2.5", "90.0 %"],
         ["m", "–", "0.500 m", "30", "20.0 %"],
-        ["m", "`pose`", "1.000 m", "2 (1.5 to 4)", "100.0 %"],
+        ["m", "`pose_nll`", "1.000 m", "2 (1.5 to 4)", "100.0 %"],
     ]
     assert rows_of(maps) == [["intel", "–", "0.5000", "0.2500"], ["intel", "`map`", "0.3750", "0.1250"]]
 
@@ -515,7 +525,9 @@ def test_the_table_of_robots_has_a_start_for_each_log():
 @pytest.mark.parametrize("write", [False, True])
 def test_the_program_of_robots(monkeypatch, tmp_path, write):
     monkeypatch.setattr(tune_robots.hosts, "use_all_cores", Recorder())
-    monkeypatch.setattr(tune_robots, "_jobs", lambda config: [("mrclam 1", "pose", lambda: "source"), ("w", "p", dict)])
+    monkeypatch.setattr(
+        tune_robots, "_jobs", lambda config: [("mrclam 1", "pose_nll", lambda: "source"), ("w", "p", dict)]
+    )
     monkeypatch.setattr(
         tune_robots,
         "_tuned",
@@ -551,7 +563,7 @@ def test_the_studies_of_the_readme(monkeypatch, tmp_path, quick):
     rows = rows_of(readme_tables._studies(config, tmp_path))
     plant = tmp_path / "plant.json"
     np.testing.assert_allclose(
-        Params.load(plant).Q, simulation.own_params(simulation.Noise(), 0.1).Q, rtol=1e-6, atol=1e-12
+        Params.load(plant).Q, simulation.own_params(simulation.Noise(), simulation.CAPSTONE).Q, rtol=1e-6, atol=1e-12
     )
     configs = [args[0] for args, _ in ran.calls]
     assert {(c.runs, c.map, c.seed, c.quick) for c in configs} == {(70, False, 4, quick)}

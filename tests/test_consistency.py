@@ -85,8 +85,8 @@ def test_the_score_of_a_pose_is_its_parts():
     np.testing.assert_allclose(score.error_square, error**2, rtol=0, atol=1e-6)
     np.testing.assert_allclose(score.variance, np.diag(P), rtol=1e-6)
     np.testing.assert_allclose(score.axis_nees, error**2 / np.diag(P), rtol=1e-4)
-    assert not score.lost  # though its NEES says so, it is not a metre off
-    assert consistency.score_pose(jnp.array(truth) + 1, jnp.array(mean), jnp.array(P)).lost
+    assert not score.diverged  # though its NEES says so, it is not a metre off
+    assert consistency.score_pose(jnp.array(truth) + 1, jnp.array(mean), jnp.array(P)).diverged
     none = consistency.score_pose(jnp.array(truth), jnp.array(mean), -jnp.array(P))
     assert not none.scored
     assert not np.any(jax.tree.leaves(none))
@@ -107,7 +107,7 @@ def test_the_robot_is_lost_beyond_a_metre_and_a_millionth(away, nees, lost):
     assert scipy.stats.chi2.isf(1e-6, 3) == pytest.approx(30.66, abs=0.01)
     error = jnp.array(away)
     P = jnp.eye(3) * jnp.sum(error**2) / nees
-    assert bool(score_pose(error, jnp.zeros(3), P).lost) == lost
+    assert bool(score_pose(error, jnp.zeros(3), P).diverged) == lost
 
 
 def test_the_documented_shares_are_those_of_normal_errors():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import reference
 
-from jaxlocmap import Gaussian, Inputs, Params, simulation
+from jaxlocmap import Gaussian, Inputs, Params, init, simulation
 from jaxlocmap.monte_carlo import monte_carlo
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
@@ -92,9 +92,10 @@ def test_the_short_form_is_the_short_form():
     landmarks, R = np.array([[9.0, 9.0], [3.0, 4.0]], np.float32), np.diag([0.1, 0.2]).astype(np.float32) ** 2
     params = Params(*precision.in_single((jnp.eye(2), jnp.array(R), jnp.array(1.0), jnp.array(-1.0))))
     prior = Gaussian(jnp.zeros(3, np.float32), jnp.array(cov))
-    last, (_, ok) = jax.jit(precision.short_form_run, static_argnames="config")(
-        params, prior, inputs, jnp.array(landmarks), config=CONFIG
+    state, (_, ok) = jax.jit(precision.short_form_run, static_argnames="config")(
+        params, init(prior, config=CONFIG), inputs, jnp.array(landmarks), config=CONFIG
     )
+    last = state.belief
     z, H = reference.expected_observation(np.zeros(3), landmarks[1])
     K = cov @ H.T @ np.linalg.inv(H @ cov @ H.T + R)
     np.testing.assert_allclose(last.cov, (np.eye(3) - K @ H) @ cov, rtol=1e-4, atol=1e-5)

@@ -15,7 +15,7 @@ import reference
 from drives import like
 from programs import Enough, Recorder, stop
 
-from jaxlocmap import Gaussian, Params, simulation
+from jaxlocmap import Gaussian, Params, motion, simulation
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import capstone
@@ -56,7 +56,7 @@ def handed_to_the_study(monkeypatch, program, config):
         program.main(config)
     ((given, how),), ((out, compute, named), _) = study.calls, parts.calls[0]
     assert started.calls == [((config.compute,), {})]
-    assert (out, compute, how) == (config.out, config.compute, {"config": config.compute, "parts": "parts"})
+    assert (out, compute, how) == (config.out, config.compute, {"config": config.compute, "checkpoint": "parts"})
     return given, named
 
 
@@ -175,7 +175,7 @@ def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     assert not same_key(key, 3)
     expected = jax.random.fold_in(jax.random.key(3), 1)
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(expected))
-    assert (study.scenario, study.config.motion, study.config.grid) == (scenario, "euler", None)
+    assert (study.scenario, study.config.motion, study.config.grid) == (scenario, motion.EULER, None)
     assert study.config.gate_probability == 0.9
     np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), scenario).R)
     assert how["devices"] == jax.local_devices()[:1]
@@ -286,7 +286,7 @@ def test_options_of_a_sweep(monkeypatch, tmp_path, options, fields):
         "motion": settings.motion,
         "runs": runs,
         "gate": settings.gate_probability,
-        "outliers": scenario.outliers,
+        "outliers": scenario.detector.outliers,
     } == expected | fields
     assert settings.grid is None
 
@@ -690,7 +690,7 @@ def test_single_runs_are_judged_one_by_one(monkeypatch):
     def monte_carlo(single, key, count, params, world, noise, prior, keep_runs):
         assert (count, keep_runs, single.scenario) == (1, True, simulation.LOOP)
         runs.append(tuple(np.asarray(jax.random.key_data(key)).tolist()))
-        np.testing.assert_array_equal(params.R, simulation.own_params(noise, 0.1).R)
+        np.testing.assert_array_equal(params.R, simulation.own_params(noise, simulation.LOOP).R)
         return SimpleNamespace(value=(np.ones((1, 5, 3)), Gaussian(np.zeros((1, 5, 3)), np.zeros((1, 5, 3, 3)))))
 
     def judge(truth, mean, cov):

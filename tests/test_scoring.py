@@ -1,7 +1,5 @@
 """What one run adds to a study, from steps and observations made up by hand."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +9,8 @@ from jaxlocmap import Gaussian
 from jaxlocmap.consistency import scoring
 from jaxlocmap.step import Observation
 
-scored = jax.jit(functools.partial(scoring.score_step, angles=(2,)))
-sighted = jax.jit(scoring.score_observation)
+scored = jax.jit(scoring.score_step, static_argnames="angles")
+observed = jax.jit(scoring.score_observation)
 totals = jax.jit(lambda *args: scoring.run_totals(*args, None, length=8, exact_start=False))
 
 
@@ -33,7 +31,7 @@ def test_bins_of_runs_are_five_percent_wide_from_a_tenth_to_ten_thousand():
 def step(error, cov, ok=True, phase=2):
     truth = jnp.array([1.0, 2.0, 3.0])
     belief = Gaussian(truth - jnp.array(error), jnp.array(cov))
-    return scored(belief, truth, jnp.array(ok), jnp.array(phase))
+    return scored(belief, truth, jnp.array(ok), jnp.array(phase), angles=(2,))
 
 
 def test_a_step_is_within_two_sigma_of_each_axis_and_inside_each_ellipsoid():
@@ -69,45 +67,44 @@ def seen(white=None):
 def test_an_observation_is_paired_with_the_one_before_it():
     """Whitened it is (1, 0.5)."""
     yes, no = jnp.array(True), jnp.array(False)
-    tally, latest = sighted(observation(), yes, yes, seen((2.0, -4.0)))
+    tally, latest = observed(observation(), yes, yes, seen((2.0, -4.0)))
     np.testing.assert_allclose(tally.lag_products, [2, -2], rtol=1e-6)
     np.testing.assert_allclose(tally.lag_squares, [(1 + 4) / 2, (0.25 + 16) / 2], rtol=1e-6)
     assert [float(x) for x in tally[:5]] == [1, 1.25, 1, 0, 0]
     assert float(tally.lag_pairs) == 1
     np.testing.assert_allclose(latest.white, [1, 0.5], rtol=1e-6)
-    first, latest = sighted(observation(accepted=False), yes, yes, seen())
+    first, latest = observed(observation(accepted=False), yes, yes, seen())
     assert not np.any(first.lag_squares)
     assert (float(first.lag_pairs), float(first.accepted)) == (0, 0)
     assert bool(latest.seen)
     # Of one that could not be used nothing is scored, and the one before it stays the last.
     for none in (observation(S=np.zeros((2, 2)), nis=0.0), observation(innovation=(np.nan, 0.1), nis=np.nan)):
-        tally, latest = sighted(none, yes, no, seen((2.0, -4.0)))
+        tally, latest = observed(none, yes, no, seen((2.0, -4.0)))
         assert [float(x) for x in (*tally[:2], *tally[3:5], tally.lag_pairs)] == [0, 0, 1, 1, 0]
         assert [float(x) for x in latest.white] == [2, -4]
         assert not np.any(tally.lag_products)
-    empty, latest = sighted(observation(S=np.zeros((2, 2)), nis=0.0, accepted=False), no, no, seen())
+    empty, latest = observed(observation(S=np.zeros((2, 2)), nis=0.0, accepted=False), no, no, seen())
     assert not any(np.any(np.asarray(x)) for x in jax.tree.leaves((empty, latest)))
 
 
-def run(nees=3.0, count=8.0, lost=0.0, cov=1.0, lag=((1.0, -2.0), (2.0, 8.0))):
+def run(nees=3.0, count=8.0, diverged=0.0, cov=1.0, lag=((1.0, -2.0), (2.0, 8.0))):
     """Steps of a run of eight, of which so many are scored, each with this NEES."""
-    zero = jnp.zeros(())
-    tally = scoring.no_steps(zero)._replace(
+    tally = scoring.no_steps(jnp.zeros(()).dtype, whole_state=False)._replace(
         scored=jnp.array(count),
         nees=jnp.array(count * nees),
         axis_nees=count * jnp.array([1.0, 2.0, 4.0]),
         within_two_sigma=count * jnp.array([0.5, 0.75, 1.0]),
         covered=count * jnp.array([0.1, 0.2, 0.3, 0.4]),
         phase_nees=jnp.array([2.0, 4.0, 6.0, 8.0]),
-        lost=jnp.array(lost),
+        diverged=jnp.array(diverged),
     )
-    sightings = scoring.no_observations(zero)._replace(
+    observations = scoring.no_observations(jnp.zeros(()).dtype, 2)._replace(
         observed=jnp.array(4.0),
         nis=jnp.array(6.0),
         lag_products=jnp.array(lag[0]),
         lag_squares=jnp.array(lag[1]),
     )
-    pairs = sightings._replace(lag_pairs=jnp.array(3.0))
+    pairs = observations._replace(lag_pairs=jnp.array(3.0))
     return totals(tally, pairs, jnp.zeros(3), Gaussian(jnp.zeros(3), cov * jnp.eye(3)))
 
 
@@ -137,7 +134,7 @@ def test_innovations_of_zero_are_not_correlated():
     [
         ({"count": 7.0}, 1, 1, 0, 0),  # a step without a score: no phase can be compared
         ({"count": 0.0}, 0, 0, 0, 0),
-        ({"lost": 2.0}, 1, 0, 0, 1),
+        ({"diverged": 2.0}, 1, 0, 0, 1),
         ({"cov": np.nan}, 1, 0, 0, 1),  # no belief at the end
     ],
 )

@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 import reference
 import scipy.stats
-from drives import like
+from drives import SHORT, like
 from jax.sharding import Mesh, PartitionSpec
 
-from jaxlocmap import GridSpec, Params, init, run, simulation
+from jaxlocmap import Params, init, run, sensors, simulation
 from jaxlocmap._internal import batching
 from jaxlocmap.consistency import COVERAGE_LEVELS
 from jaxlocmap.consistency.scoring import NEES_EDGES, PHASES, Averages, Undiverged
 from jaxlocmap.consistency.study import MapTotals, Study, Totals, median_nees, pose_means, reference_study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
+from jaxlocmap.motion import EULER
 from jaxlocmap.simulation import CAPSTONE, LOOP, Noise
 
 # What the plant really does, seen by a first-order filter: the heading noise of a step is a yaw rate's as well.
@@ -29,15 +30,6 @@ PLANT = {"v": 0.02, "w": math.hypot(0.01, 0.005 / 0.1), "range": 0.08, "bearing"
 # either, what is left of the loop is a filter that is right but for its linearisation.
 HONEST = like(LOOP, name="honest", detector=dict(max_range=1e3))
 HONEST_CONFIG = HONEST.config(motion="euler", gate_probability=None, grid=False)
-SHORT = like(
-    CAPSTONE,
-    name="short",
-    start=(6.0, 8.5, 0.5),
-    steps=12,
-    beams=9,
-    detector=dict(period=2),
-    robot=dict(grid=GridSpec(origin=(0.0, 0.0), resolution=0.6, shape=(20, 20))),
-)
 PLAIN = {"xla_backend_optimization_level": 0}  # compiles in two thirds of the time, to slower programs
 ERRORS = 4  # standard errors a statistic may be off: a right program misses one in 16,000
 FAULTS = ("none", "control", "bearing", "range", "heading", "scan", "Q", "R", "blind", "off_map", "wild")
@@ -222,15 +214,23 @@ def test_map_scores_are_there_only_with_a_grid(capstones, faulty):
 
 
 SHORT_CONFIG = SHORT.config(motion="euler")
-# Sightings that can be false, a sensor off the robot's centre, a filter of another period, and a gate that is a value.
+# Sightings that can be false, a sensor off the robot's centre, another period, and a gate that is a value.
 LIED = like(
-    LOOP, name="lied", steps=40, detector=dict(period=3, outliers=True), robot=dict(sensor_offset=(0.1, -0.05, 0.03))
+    LOOP,
+    name="lied",
+    steps=40,
+    detector=dict(period=3, outliers=True),
+    robot=dict(dt=0.2, sensor_offset=(0.1, -0.05, 0.03)),
 )
-LIED_CONFIG = dataclasses.replace(LIED.config(gate_probability=None, grid=False), dt=0.2)
+LIED_CONFIG = LIED.config(gate_probability=None, grid=False)
 
 
 short = functools.partial(studied, scenario=SHORT, config=SHORT_CONFIG)
-lied = functools.partial(studied, scenario=LIED, config=LIED_CONFIG)
+
+
+def lied(key, params, world, noise, prior, gate):
+    params = params._replace(gate_probability=gate)
+    return studied(key, params, world, noise, prior, scenario=LIED, config=LIED_CONFIG)
 
 
 def batch(faults):
@@ -448,9 +448,14 @@ def test_a_gate_given_as_a_value_is_that_of_the_configuration(tolerance):
     assert np.all(runs.accepted[2:] == runs.observed[2:])
 
 
+def behind(key, params, world, noise, prior, gate):
+    """A run behind a gate that is a value."""
+    return Study(LIED, LIED_CONFIG)(key, params._replace(gate_probability=gate), world, noise, prior)
+
+
 def test_a_gate_may_be_an_array_that_is_not_traced():
     key, *args, gate = jax.tree.map(lambda x: x[0], lies())
-    jax.eval_shape(lambda key: Study(LIED, LIED_CONFIG)(key, *args, gate), key)
+    jax.eval_shape(lambda key: behind(key, *args, gate), key)
 
 
 def test_sightings_are_false_as_often_as_they_are_said_to_be():
@@ -548,7 +553,7 @@ def test_the_slope_of_a_total_is_a_finite_difference(x64):
 def test_a_run_that_goes_wrong_has_a_slope_all_the_same(fault):
     (value, _), slope = alone(fault)
     assert math.isfinite(value)
-    assert all(np.all(np.isfinite(x)) for x in slope), slope
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(slope)), slope
 
 
 def test_shard_map_over_runs_needs_no_wrapper(faulty, tolerance):
@@ -566,7 +571,7 @@ def test_shard_map_takes_any_argument_apart(batched):
     args = [x if i == batched else jax.tree.map(lambda x: x[0], x) for i, x in enumerate(lies())]
     axes = tuple(0 if i == batched else None for i in range(6))
     specs = tuple(runs if i == batched else PartitionSpec() for i in range(6))
-    study = jax.vmap(Study(LIED, LIED_CONFIG), axes)
+    study = jax.vmap(behind, axes)
     jax.eval_shape(jax.shard_map(study, mesh=mesh, in_specs=specs, out_specs=runs), *args)
 
 
@@ -898,7 +903,7 @@ def test_a_filter_that_is_told_the_truth_differs_in_nothing_else():
     config = dataclasses.replace(SHORT.config(motion="capstone", gate_probability=0.9), sensor_offset=(0.1, 0.2, 0.3))
     noise = Noise(heading=0.01, v=0.03, w=0.02, range=0.1, bearing=0.05)
     study, params = reference_study(SHORT, config, noise)
-    assert study == Study(SHORT, dataclasses.replace(config, motion="euler", grid=None))
+    assert study == Study(SHORT, dataclasses.replace(config, motion=EULER, grid=None))
     jax.tree.map(np.testing.assert_array_equal, params, simulation.own_params(noise, SHORT))
 
 
@@ -926,10 +931,21 @@ def test_the_median_of_the_runs_average_nees_is_numpy_s_to_a_bin():
     assert median_nees(np.eye(len(bins))[-1]) == math.inf
 
 
-def test_a_study_of_a_sensor_that_sits_elsewhere_is_refused():
-    study = Study(SHORT, dataclasses.replace(SHORT_CONFIG, sensor_offset=(0.1, 0.0, 0.0)))
+@pytest.mark.parametrize(
+    ("name", "other", "own"),
+    [
+        ("dt", 0.2, "0.1"),
+        ("sensor", sensors.RANGE_BEARING._replace(positive=()), "range_bearing"),
+        ("sensor_offset", (0.1, 0.0, 0.0), "(0.0, 0.0, 0.0)"),
+        ("scanner_offset", (0.1, 0.0, 0.0), "(0.0, 0.0, 0.0)"),
+        ("min_range", 0.1, "0.05"),
+        ("max_range", 7.0, "8.0"),
+    ],
+)
+def test_a_study_of_a_filter_on_another_robot_is_refused(name, other, own):
+    study = Study(SHORT, dataclasses.replace(SHORT_CONFIG, **{name: other}))
     args = simulation.course_params(), simulation.room(), Noise(), SHORT.prior()
-    with pytest.raises(ValueError, match=r"config\.sensor_offset: expected that of the scenario, \(0\.0, 0\.0, 0\.0\)"):
+    with pytest.raises(ValueError, match=re.escape(f"config.{name}: expected that of the scenario, {own}, got")):
         study(jax.random.key(0), *args)
 
 

@@ -43,9 +43,9 @@ ENTERED = {
 class Stub:
     """In the place of a study: hands back what it was given."""
 
-    def __call__(self, key, params, world, noise, prior, gate_probability=None):
+    def __call__(self, key, params, world, noise, prior):
         del key, world, prior
-        gate = jnp.zeros(()) if gate_probability is None else gate_probability
+        gate = jnp.zeros(()) if params.gate_probability is None else params.gate_probability
         return {"Q": params.Q, "R": params.R, "rate": jnp.asarray(noise.outlier_rate, float), "gate": gate}
 
 
@@ -130,7 +130,8 @@ def alone(rate, gate):
     """A study of one cell."""
     params, world, noise, prior = shared()
     noise = noise._replace(outlier_rate=jnp.asarray(rate, float))
-    arguments = (params, world, noise, prior, jnp.asarray(gate, float))
+    params = params._replace(gate_probability=jnp.asarray(gate, float))
+    arguments = (params, world, noise, prior)
     return monte_carlo(Study(SHORT, settings()), jax.random.key(0), RUNS, *arguments).value
 
 

@@ -40,7 +40,7 @@ def test_simulated_drives(tmp_path):
     assert set(report["parameters"]) == {"range", "bearing"}
     for value in report["parameters"].values():
         assert {"start", "end", "standard_error", "interval_95", "unit"} == set(value)
-    losses = report["loss"]["innovation"]
+    losses = report["loss"]["innovation_nll"]
     assert losses["train_after"] < losses["train_before"] - 0.3
     assert losses["validation_after"] < losses["validation_before"] - 0.3
     before, after = report["held_out"]["before"], report["held_out"]["after"]
@@ -57,7 +57,9 @@ def test_simulated_drives(tmp_path):
 
 def test_ctrl_c_while_judging_stops_at_once_and_says_what_is_kept(monkeypatch, tmp_path):
     trace = Trace(*np.zeros((4, 4)), params={"range": np.ones(4)})
-    found = tuning.Fit(simulation.own_params(simulation.Noise(), 0.1), 1.0, np.ones(3), trace, 0, False, 0.0, 0.0)
+    found = tuning.Fit(
+        simulation.own_params(simulation.Noise(), simulation.CAPSTONE), 1.0, np.ones(3), trace, 0, False, 0.0, 0.0
+    )
     source = tune.Source("made", found.params, Config(dt=0.1), *[None] * 3, None, 0.1)
     monkeypatch.setattr(tune, "_source", lambda *_: source)
 
@@ -65,13 +67,13 @@ def test_ctrl_c_while_judging_stops_at_once_and_says_what_is_kept(monkeypatch, t
         progress(found)
         return found
 
-    def certainty(*_):
+    def standard_errors(*_):
         threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
         working_in.append(threading.current_thread())
         time.sleep(5)
 
     monkeypatch.setattr(tune.tuning, "fit", fit)
-    monkeypatch.setattr(tune.tuning, "certainty", certainty)
+    monkeypatch.setattr(tune.tuning, "standard_errors", standard_errors)
     working_in, began = [], time.monotonic()
     at_first = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     try:

@@ -27,7 +27,7 @@ START = Params.from_std(v=0.1, w=0.2, range=0.3, bearing=0.4)
 
 
 def wanted(*losses, start=None, gate=0.999, judge_gate=0.9, seed=3, quick=False, max_gap=1.5):
-    return Wanted(losses or ("innovation",), start, gate, judge_gate, seed, quick, max_gap)
+    return Wanted(losses or ("innovation_nll",), start, gate, judge_gate, seed, quick, max_gap)
 
 
 def key_data(key):
@@ -44,7 +44,7 @@ def scene(monkeypatch):
         "simulated": Recorder(),
         "monte_carlo": Recorder(SimpleNamespace(value="totals")),
         "summarise": None,
-        "foresight": Recorder({"log_loss": 0.5}),
+        "predictive_score": Recorder({"log_loss": 0.5}),
     }
     stubs["summarise"] = summarise = Recorder()
     simulated = stubs["simulated"]
@@ -53,7 +53,7 @@ def scene(monkeypatch):
     )
     monkeypatch.setattr(tune_sources, "monte_carlo", stubs["monte_carlo"])
     monkeypatch.setattr(tune_sources, "summarise", lambda *args: summarise(*args) or {"anees": 3.0})
-    monkeypatch.setattr(tune_sources, "_foresight", stubs["foresight"])
+    monkeypatch.setattr(tune_sources, "_predictive_score", stubs["predictive_score"])
     return SimpleNamespace(**stubs)
 
 
@@ -92,14 +92,14 @@ def test_a_map_is_tuned_and_judged_in_rooms_of_their_own(scene, monkeypatch):
     rooms = [np.asarray(args[2]) for args, _ in scene.simulated.calls]
     assert len({room.tobytes() for batch in rooms for room in batch}) == 69
     assert source.config.grid == simulation.CAPSTONE.robot.grid
-    own, course = simulation.own_params(simulation.Noise(), 0.1), simulation.course_params()
+    own, course = simulation.own_params(simulation.Noise(), simulation.CAPSTONE), simulation.course_params()
     np.testing.assert_array_equal(source.start.R, own.R)  # a robot that knows its own noise
     assert (source.start.l_occ, source.start.l_free) == (course.l_occ, course.l_free)
     assert source.evidence(START) == {"anees": 3.0, "one_scan_ahead": {"log_loss": 0.5}}
     ((study, _, runs, *_), _) = scene.monte_carlo.calls[0]
     assert (runs, study.config.grid) == (200, simulation.CAPSTONE.robot.grid)
-    assert scene.foresight.calls == [((START, "batch of 64", study.config), {})]
-    both = tune_sources.from_scenario("capstone", "arc", 4, 10, wanted("map", "pose"))
+    assert scene.predictive_score.calls == [((START, "batch of 64", study.config), {})]
+    both = tune_sources.from_scenario("capstone", "arc", 4, 10, wanted("map", "pose_nll"))
     np.testing.assert_array_equal(both.start.R, course.R)
     assert [args[1] for args, _ in scene.simulated.calls[3:]] == [10, 4, 1]
 
@@ -264,7 +264,7 @@ def scans(count, seen=5.0):
 @pytest.mark.parametrize(("count", "quick", "used"), [(60, False, 60), (71, False, 71), (71, True, 60)])
 def test_scans_are_tuned_on_the_first_half_and_judged_on_the_second(monkeypatch, count, quick, used):
     monkeypatch.setattr(tune_sources, "read", lambda *_: scans(count))
-    monkeypatch.setattr(tune_sources, "_foresight", foresight := Recorder("evidence"))
+    monkeypatch.setattr(tune_sources, "_predictive_score", scored := Recorder("evidence"))
     source = tune_sources.from_scans(Path("a/b.log"), 0.5, 8.0, wanted("map", quick=quick))
     half = used // 2
     assert source.name == f"b.log, first {half} of {used} scans"
@@ -279,7 +279,7 @@ def test_scans_are_tuned_on_the_first_half_and_judged_on_the_second(monkeypatch,
     np.testing.assert_array_equal(source.train.beam_angles, [-0.5, 0, 0.5])
     np.testing.assert_array_equal(source.start.R, simulation.course_params().R)
     assert source.evidence(START) == {"one_scan_ahead": "evidence"}
-    ((params, later, config), _) = foresight.calls[0]
+    ((params, later, config), _) = scored.calls[0]
     assert (params, config) == (START, source.config)
     np.testing.assert_array_equal(np.asarray(later.counted)[0], np.arange(used) >= half)
     assert later.inputs.ranges.shape[1] == used
@@ -294,7 +294,7 @@ def test_runs_of_scans_validate_in_a_long_log(monkeypatch):
     assert held[:12].tolist() == [24, 25, 26, 27, 28, 29, 54, 55, 56, 57, 58, 59]
 
 
-def test_what_is_foreseen_is_averaged_over_cells(monkeypatch):
+def test_a_predictive_score_is_averaged_over_cells(monkeypatch):
     sums = PredictiveScore(
         log_loss=np.array(6.0),
         cells=np.array(8.0),
@@ -302,8 +302,8 @@ def test_what_is_foreseen_is_averaged_over_cells(monkeypatch):
         bin_probability=np.array([1.0, 0.0, 3.0]),
         bin_hits=np.array([2.0, 0.0, 2.5]),
     )
-    monkeypatch.setattr(tune_sources, "_foreseen", lambda params, batch, config: sums)
-    assert tune_sources._foresight(START, None, None) == {
+    monkeypatch.setattr(tune_sources, "_predictive_sums", lambda params, batch, config: sums)
+    assert tune_sources._predictive_score(START, None, None) == {
         "log_loss": 0.75,
         "cells": 8.0,
         "calibration_error": 1.5 / 8,
@@ -314,13 +314,13 @@ def test_what_is_foreseen_is_averaged_over_cells(monkeypatch):
 
 
 @pytest.mark.parametrize("given", [True, False])
-def test_scans_are_foreseen_from_the_poses_of_the_batch_or_the_filter(monkeypatch, given):
+def test_scans_are_predicted_from_the_poses_of_the_batch_or_the_filter(monkeypatch, given):
     seen = Recorder({"sum": np.array([[1.0, 2.0], [10.0, 20.0]])})
-    monkeypatch.setattr(tune_sources.tuning, "foreseen", seen)
+    monkeypatch.setattr(tune_sources.tuning, "predictive_score", seen)
     monkeypatch.setattr(tune_sources.tuning, "beliefs", lambda *_, **__: SimpleNamespace(mean="filter"))
     batch = SimpleNamespace(poses="batch" if given else None)
     config = Config()
-    sums = tune_sources._foreseen.__wrapped__(START, batch, config=config)
+    sums = tune_sources._predictive_sums.__wrapped__(START, batch, config=config)
     assert sums["sum"].tolist() == [11, 22]
     poses = "batch" if given else "filter"
     assert seen.calls == [((START.l_occ, START.l_free, batch, poses), {"config": config, "bins": True})]
@@ -456,17 +456,17 @@ def test_the_whole_program(monkeypatch, tmp_path):
     monkeypatch.setattr(tune, "_source", Recorder(source))
     monkeypatch.setattr(tune, "_fit", fitted := Recorder(made_fit()))
     monkeypatch.setattr(tune, "_figures", figures := Recorder([]))
-    monkeypatch.setattr(tune.tuning, "certainty", certain)
+    monkeypatch.setattr(tune.tuning, "standard_errors", certain)
     losses = {("own", "train"): 8.0, ("own", "validation"): 7.0, ("found", "train"): 6.0, ("found", "validation"): 5.0}
 
     class Objective:
-        names = ("pose",)
+        names = ("pose_nll",)
 
         def __init__(self, config, weights):
-            assert (config, weights) == (source.config, (("pose", 2.0),))
+            assert (config, weights) == (source.config, (("pose_nll", 2.0),))
 
         def judged(self, params, batch):
-            return 0, {"pose": losses["own" if params is own else "found", batch]}
+            return 0, {"pose_nll": losses["own" if params is own else "found", batch]}
 
     monkeypatch.setattr(tune.tuning, "Objective", Objective)
     config = tune.TuneConfig(loss=("pose=2",), tune=("range", "v"), seed=9, out=tmp_path, epochs=3)
@@ -486,7 +486,7 @@ def test_the_whole_program(monkeypatch, tmp_path):
     assert report["parameters"]["v"]["start"] == pytest.approx(0.5)
     assert report["parameters"]["v"]["standard_error"] == 0.01
     assert report["loss"] == {
-        "pose": {"train_before": 8.0, "validation_before": 7.0, "train_after": 6.0, "validation_after": 5.0}
+        "pose_nll": {"train_before": 8.0, "validation_before": 7.0, "train_after": 6.0, "validation_after": 5.0}
     }
     drive = {"anees": 5.0}
     assert report["held_out"] == {
@@ -498,7 +498,7 @@ def test_the_whole_program(monkeypatch, tmp_path):
         for name in ("source", "losses", "seed", "evaluations", "skipped_steps", "best_epoch", "steps_per_epoch")
     } == {
         "source": "source",
-        "losses": {"pose": 2.0},
+        "losses": {"pose_nll": 2.0},
         "seed": 9,
         "evaluations": 5,
         "skipped_steps": 1,
@@ -563,7 +563,7 @@ def test_what_tuning_says(monkeypatch):
             "after": {"anees": 3.5, "robot 4": {"nis_mean": 2.0, "brier": None}},
         },
         "loss": {
-            "pose": {"train_before": 3.0, "train_after": 2.0, "validation_before": 3.5, "validation_after": 2.5},
+            "pose_nll": {"train_before": 3.0, "train_after": 2.0, "validation_before": 3.5, "validation_after": 2.5},
             "nis": {"train_before": 1.0, "train_after": 0.5, "validation_before": None, "validation_after": None},
         },
         "not_identified": ["v is anything"],

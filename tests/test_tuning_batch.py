@@ -92,9 +92,9 @@ def test_an_unknown_truth_is_not_judged():
     inputs, prior = jax.tree.map(lambda x: x[0], (batch.inputs, batch.prior))
     one = tuning.sequence(inputs, prior, landmarks=batch.landmarks, truth=truth)
     sums = every_sum(tuning.join(one, tuning.pick(batch, slice(1, 4))))
-    assert float(sums["pose"][1][0]) == 9
-    assert float(sums["innovation"][1][0]) == np.asarray(batch.inputs.valid)[0].sum()
-    assert np.isfinite(float(sums["pose"][0][0]))
+    assert float(sums["pose_nll"][1][0]) == 9
+    assert float(sums["innovation_nll"][1][0]) == np.asarray(batch.inputs.valid)[0].sum()
+    assert np.isfinite(float(sums["pose_nll"][0][0]))
 
 
 # --- Every field, in numbers that tell where they come from

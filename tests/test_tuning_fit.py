@@ -13,6 +13,7 @@ from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
 from jax.flatten_util import ravel_pytree
 
 from jaxlocmap import Gaussian, Params, simulation, tuning
+from jaxlocmap.tuning.parameters import BLOCKS
 
 OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation_nll", 1.0),))
 START = simulation.course_params()
@@ -98,6 +99,8 @@ class Bowl:
     """In place of an objective: Σ (log range)² · weight over the sequences, whose weights are in the prior's mean. What
     is judged may be told beforehand.
     """
+
+    blocks = BLOCKS
 
     def __init__(self, told=()):
         self.told, self.asked = list(told), []
@@ -227,7 +230,7 @@ def test_two_equations_do_not_tell_three_parameters(losses):
     objective.check_tuned(("v", "range", "l_occ", "l_free"))
 
 
-@pytest.mark.parametrize("losses", [("nees", "pose"), ("nis", "innovation"), ("nees", "nis", "state"), ("map",)])
+@pytest.mark.parametrize("losses", [("nees", "pose_nll"), ("nis", "innovation_nll"), ("nees", "nis", "mse"), ("map",)])
 def test_beside_another_loss_they_may(losses):
     tuning.Objective(CONFIG, tuple((name, 1.0) for name in losses)).check_tuned(tuning.NAMES)
 

@@ -67,9 +67,9 @@ def by_hand(info, truth, counted, known):
     nees = nees_of(info, truth)
     log_det = np.linalg.slogdet(info.belief.cov)[1]
     return {
-        "innovation": -np.log(0.99 * density + 0.01 / (2 * np.pi * ONLY_POSES.max_range)).mean(),
-        "pose": 0.5 * (nees + log_det + 3 * np.log(2 * np.pi))[judged].mean(),
-        "state": (e**2).sum(-1)[judged].mean(),
+        "innovation_nll": -np.log(0.99 * density + 0.01 / (2 * np.pi * ONLY_POSES.max_range)).mean(),
+        "pose_nll": 0.5 * (nees + log_det + 3 * np.log(2 * np.pi))[judged].mean(),
+        "mse": (e**2).sum(-1)[judged].mean(),
         "nees": from_chi(nees[judged], 3),
         "nis": from_chi(info.nis[seen], 2),
     }
@@ -120,7 +120,7 @@ def test_the_map_is_mapped_where_it_is_told(tolerance):
     assert alone("map", OTHER, blind, CONFIG) == pytest.approx(exact, rel=tolerance(1e-13, 1e-6))
 
 
-@pytest.mark.parametrize("names", [("innovation_nll", "pose", "state", "nees", "nis"), ("map",)])
+@pytest.mark.parametrize("names", [("innovation_nll", "pose_nll", "mse", "nees", "nis"), ("map",)])
 def test_gradients_are_what_differences_give(names, x64):
     config, tuned = (CONFIG, tuning.SENSOR_MODEL) if names == ("map",) else (ONLY_POSES, tuning.FULL_NOISE)
     objective, batch = tuning.Objective(config, tuple((name, 1.0) for name in names)), drives()
@@ -178,8 +178,8 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     own, h = tuning.unconstrain(OWN), 0.02
     places, weights = np.polynomial.legendre.leggauss(6)
     missed = {}
-    for softness in (0.0, 2.0):
-        config = dataclasses.replace(ONLY_POSES, gate_temperature=softness)
+    for temperature in (0.0, 2.0):
+        config = dataclasses.replace(ONLY_POSES, gate_temperature=temperature)
         objective = tuning.Objective(config, (("innovation_nll", 1.0),))
         f = lambda at, batch, objective=objective: objective(tuning.constrain(own | at), batch)  # noqa: E731
         places_w = own["w"] + h * jnp.asarray([-1, *places, 1])
@@ -187,7 +187,7 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
             places_w
         )
         change, added_up = float(value[-1] - value[0]), h * float(np.sum(weights * np.asarray(slope[1:-1])))
-        missed[softness] = abs(change - added_up) / (2 * h)
+        missed[temperature] = abs(change - added_up) / (2 * h)
     assert missed[2.0] < 1e-3 < 0.1 < missed[0.0]
 
 
@@ -202,14 +202,16 @@ def test_the_map_is_told_the_configuration_and_the_batch(monkeypatch):
 
     monkeypatch.setattr(losses, "predict_scans", predict_scans)
     batch = some_of(drives())
-    config = dataclasses.replace(CONFIG, min_range=0.3, max_range=7.0)
+    config = dataclasses.replace(CONFIG, min_range=0.3, max_range=7.0, scanner_offset=(0.1, 0.0, 0.2))
     got = losses.predictive_score(jnp.array(0.5), jnp.array(-0.25), batch, batch.truth, config=config, bins=True)
     counted = np.asarray(batch.counted).sum(1)
     rest = np.asarray(batch.truth).sum((1, 2)) + np.asarray(batch.inputs.ranges).sum((1, 2))
     np.testing.assert_allclose(got.log_loss, counted + rest, rtol=1e-4)
     np.testing.assert_array_equal(got.cells, counted)
-    assert told[0][0] == {"spec": CONFIG.grid, "min_range": 0.3, "max_range": 7.0, "bins": True}
-    np.testing.assert_array_equal(told[0][1], batch.beam_angles)
+    scanner = told[0].pop("scanner")
+    assert told[0] == {"spec": CONFIG.grid, "bins": True}
+    assert (scanner.min_range, scanner.max_range, scanner.offset) == (0.3, 7.0, (0.1, 0.0, 0.2))
+    np.testing.assert_array_equal(scanner.beam_angles, batch.beam_angles)
     for missing in (
         {"config": ONLY_POSES},
         {"batch": batch._replace(beam_angles=None)},
@@ -224,12 +226,12 @@ def test_a_map_has_no_slope_by_the_poses(monkeypatch):
     def filtered(params, batch, **_):
         return {}, jnp.ones((4, 12)), jnp.broadcast_to(params.R[0, 0], (4, 12, 3))
 
-    def foreseen(l_occ, l_free, batch, poses, **_):
+    def predictive_score(l_occ, l_free, batch, poses, **_):
         each = l_occ * jnp.sum(poses, axis=(1, 2))
         return PredictiveScore(each, jnp.ones(4), *[jnp.zeros(3)] * 3)
 
     monkeypatch.setattr(losses, "filtered", filtered)
-    monkeypatch.setattr(losses, "foreseen", foreseen)
+    monkeypatch.setattr(losses, "predictive_score", predictive_score)
     objective = tuning.Objective(CONFIG, (("map", 1.0),))
     value, slope = jax.value_and_grad(lambda params: objective(params, drives())[0])(OWN)
     sums = 36 * float(OWN.R[0, 0])
@@ -259,7 +261,7 @@ def test_what_lies_in_steps_that_do_not_count_is_nothing_to_tune_on():
         some = jnp.broadcast_to(jnp.asarray(half), (4, 12))
         unseen = batch.inputs._replace(valid=jnp.asarray(valid & ~half[:, None]))
         refused("expected an observation for the loss `nis`, got none", (("nis", 1.0),), counted=some, inputs=unseen)
-        refused("a step with a known pose for the loss `state`", (("mse", 1.0),), counted=some, known=~some)
+        refused("a step with a known pose for the loss `mse`", (("mse", 1.0),), counted=some, known=~some)
     refused("expected scans", (("map", 1.0),), config=CONFIG, beam_angles=None)
 
 
@@ -279,7 +281,7 @@ def refused(match, objective=(("innovation_nll", 1.0),), params=OWN, config=ONLY
 
 
 def test_a_log_without_truth():
-    refused("the true poses, which the loss `pose` needs, got None", (("pose_nll", 1.0),), truth=None)
+    refused("the true poses, which the loss `pose_nll` needs, got None", (("pose_nll", 1.0),), truth=None)
     nowhere = jnp.zeros_like(drives().known)
     refused("a step with a known pose for the loss `nees`, got none", (("nees", 1.0),), known=nowhere)
 
@@ -287,7 +289,7 @@ def test_a_log_without_truth():
 def test_a_batch_in_which_nothing_is_observed():
     inputs = drives().inputs
     blind = inputs._replace(valid=jnp.zeros_like(inputs.valid))
-    refused("expected an observation for the loss `innovation`, got none", inputs=blind)
+    refused("expected an observation for the loss `innovation_nll`, got none", inputs=blind)
     refused(
         "expected scans, which the loss `map` needs",
         (("map", 1.0),),
@@ -307,7 +309,8 @@ def test_a_start_that_is_not_finite():
     covs[2] = -np.eye(3)
     prior = drives().prior._replace(cov=jnp.asarray(covs))
     refused(
-        "loss `pose`: expected a finite value at the start, got none for 1 of 4 sequences, the first being number 2",
+        "loss `pose_nll`: expected a finite value at the start, got none for 1 of 4 sequences, the first being "
+        "number 2",
         (("pose_nll", 1.0),),
         prior=prior,
     )
@@ -318,9 +321,9 @@ def test_a_start_that_is_not_finite():
     [
         ((), "expected at least one of"),
         ((("speed", 1.0),), "expected one of .* got 'speed'"),
-        ((("pose", 0.0),), "weight of pose: expected a positive number, got 0.0"),
-        ((("pose", math.nan),), "weight of pose"),
-        ((("pose", math.inf),), "weight of pose"),
+        ((("pose_nll", 0.0),), "weight of pose_nll: expected a positive number, got 0.0"),
+        ((("pose_nll", math.nan),), "weight of pose_nll"),
+        ((("pose_nll", math.inf),), "weight of pose_nll"),
         ((("pose_nll", 1.0), ("nis", -1.0)), "weight of nis: expected a positive number, got -1.0"),
         ((("map", 1.0),), "config.grid: expected the GridSpec"),
     ],
