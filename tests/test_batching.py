@@ -20,7 +20,7 @@ class Carry(NamedTuple):
     vector: jax.Array  # (3,)
     matrix: jax.Array  # (2, 3)
     nothing: jax.Array  # (0, 3)
-    large: jax.Array  # (4, 5)
+    large: jax.Array  # (2, 10)
     scalar: jax.Array  # ()
     count: jax.Array  # (2,) int32
     flag: jax.Array  # () bool
@@ -29,7 +29,7 @@ class Carry(NamedTuple):
 
 def carry(seed=0):
     rng = np.random.default_rng(seed)
-    reals = (jnp.asarray(rng.normal(size=shape)) for shape in ((3,), (2, 3), (0, 3), (4, 5), ()))
+    reals = (jnp.asarray(rng.normal(size=shape)) for shape in ((3,), (2, 3), (0, 3), (2, 10), ()))
     return Carry(*reals, jnp.array([seed, 1], jnp.int32), jnp.array(seed % 2 == 0), None)
 
 
@@ -153,8 +153,8 @@ def test_small_arrays_travel_entry_by_entry_and_others_whole(monkeypatch):
     def watched(name):
         real = getattr(jax.lax, name)
 
-        def call(*args):
-            results = real(*args)
+        def call(*args, **kwargs):
+            results = real(*args, **kwargs)
             travelling.append([x.shape for x in (results[0] if name == "scan" else results)])
             return results
 
@@ -163,18 +163,31 @@ def test_small_arrays_travel_entry_by_entry_and_others_whole(monkeypatch):
     watched("scan")
     watched("cond")
     jax.eval_shape(lambda carry: FORMS["scan"][0](carry, XS), carry())
-    assert travelling.pop() == [()] * (3 + 6) + [(0, 3), (4, 5)] + [()] * (1 + 2 + 1)
+    assert travelling.pop() == [()] * (3 + 6) + [(0, 3), (2, 10)] + [()] * (1 + 2 + 1)
     jax.eval_shape(lambda carry: FORMS["cond"][0](carry, XS), carry())
-    assert set(travelling.pop()) == {(), (0, 3), (4, 5)}
+    assert set(travelling.pop()) == {(), (0, 3), (2, 10)}
 
 
-@pytest.mark.parametrize(("shape", "small"), [((9,), True), ((3, 3), True), ((10,), False), ((2, 5), False)])
-def test_arrays_of_up_to_nine_entries_are_small(shape, small):
+@pytest.mark.parametrize(
+    ("shape", "small"),
+    [
+        ((9,), True),
+        ((3, 3), True),
+        ((2, 5), True),
+        ((9, 9), True),
+        ((10,), False),
+        ((2, 10), False),
+        ((10, 2), False),
+        ((0, 3), False),
+        ((2, 2, 2), False),
+    ],
+)
+def test_vectors_and_matrices_with_no_side_above_nine_are_small(shape, small):
     """As the covariance of a pose is."""
     x = np.arange(np.prod(shape)).reshape(shape)
-    parts, together = batching.apart([jnp.array(x)])
+    parts, stack = batching.unstack([jnp.array(x)])
     assert [part.shape for part in parts] == ([()] * x.size if small else [shape])
-    np.testing.assert_array_equal(together(parts)[0], x)
+    np.testing.assert_array_equal(stack(parts)[0], x)
 
 
 def test_a_branch_on_what_all_share_stays_one_in_a_batch():
@@ -257,9 +270,12 @@ def test_any_in_batch_is_one_answer_for_all():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 3, True, np.zeros((0, 3)), np.zeros((2, 2))])
-def test_zero_like_any_is_zero_whatever_the_values(value):
-    zero = jax.jit(batching.zero_like_any)({"a": jnp.asarray(value)}, None, jnp.array([1.0]))
-    assert (int(zero), zero.dtype, zero.shape) == (0, jnp.int32, ())
+def test_what_differs_between_devices_adds_nothing_whatever_its_values(value):
+    given = {"real": jnp.array([1.5, -2.0]), "whole": jnp.array(3), "flags": jnp.array([True, False]), "none": None}
+    for tree, like in ((given, ({"a": jnp.asarray(value)}, None)), (given | {"a": jnp.asarray(value)}, jnp.ones(1))):
+        got = jax.jit(batching._vary)(tree, like)
+        chex.assert_trees_all_equal_shapes_and_dtypes(got, tree)
+        jax.tree.map(np.testing.assert_array_equal, got, tree)
 
 
 def over_runs(function, in_axes=0):

@@ -15,6 +15,7 @@ import reference
 from jaxlocmap import GridSpec
 from jaxlocmap._internal import random
 from jaxlocmap.mapping import grid, quality, rays
+from jaxlocmap.types import Scanner
 
 SIDE = 401
 SPEC = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(SIDE, SIDE - 1))
@@ -24,7 +25,7 @@ both_forms = pytest.mark.parametrize("max_range", [1000.0, 5000.0], ids=["float3
 
 @functools.partial(jax.jit, static_argnames="max_range")
 def placed(pose, ranges, angles, *, max_range):
-    lines = rays.trace(pose, ranges, angles, spec=SPEC, min_range=0.0, max_range=max_range)
+    lines = rays.trace(pose, ranges, Scanner(angles, min_range=0.0, max_range=max_range), spec=SPEC)
     j = jnp.arange(SIDE, dtype=jnp.int32)[None]
     ends = lines.last[:, None]
     return lines, rays.cells_at(lines, j), rays.flat_cells(lines, j, SPEC), rays.flat_cells(lines, ends, SPEC)
@@ -105,13 +106,13 @@ def test_a_map_of_twenty_scans_is_numpys(course, tolerance):
     rng = np.random.default_rng(4)
     poses = np.column_stack([rng.uniform(2, 8, 20), rng.uniform(2, 8, 20), rng.uniform(-3, 3, 20)])
     ranges = rng.uniform(0.2, 9, (20, len(reference.COURSE_ANGLES)))
+    scanner = Scanner(course.beam_angles, min_range=scan["min_range"], max_range=scan["max_range"])
 
     @jax.jit
     def mapped(poses, ranges):
         def add(log_odds, now):
-            limits = {"spec": course.grid, "min_range": scan["min_range"], "max_range": scan["max_range"]}
             l_occ, l_free = course.params.l_occ, course.params.l_free
-            return grid.update_log_odds(log_odds, *now, course.beam_angles, l_occ, l_free, **limits), None
+            return grid.update_log_odds(log_odds, *now, l_occ, l_free, scanner=scanner, spec=course.grid), None
 
         return jax.lax.scan(add, jnp.zeros(course.grid.shape), (poses, ranges))[0]
 

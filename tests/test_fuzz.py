@@ -20,6 +20,7 @@ import time
 import warnings
 import zlib
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -31,7 +32,7 @@ from test_logs import MRCLAM, woods
 from jaxlocmap import Params, logs
 from jaxlocmap.logs.matlab import read_matrices
 from jaxlocmap.mapping.ros import load_map
-from jaxlocmap.monte_carlo.checkpoint import Checkpoint, _own_digest
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint, _owndigest
 from jaxlocmap.monte_carlo.lock import Lock
 
 INPUTS = int(os.environ.get("JAXLOCMAP_FUZZ", "2000"))
@@ -109,7 +110,7 @@ def read_map(folder):
 def read_params(folder):
     params = Params.load(folder / "params.json")
     params.check()
-    assert all(np.all(np.isfinite(value)) for value in params)
+    assert all(np.all(np.isfinite(value)) for value in jax.tree.leaves(params))
 
 
 def go_on(folder):
@@ -384,7 +385,7 @@ def sealed(name, data):
     if name.endswith("manifest.json"):
         try:
             found = json.loads(data)
-            found["digest"] = _own_digest({key: found[key] for key in found.keys() - {"made by", "digest"}})
+            found["digest"] = _owndigest({key: found[key] for key in found.keys() - {"made by", "digest"}})
             return json.dumps(found).encode()
         except (ValueError, AttributeError, RecursionError):
             return data
@@ -517,7 +518,13 @@ def test_what_is_far_larger_than_it_looks_is_refused_at_once(reader, name, bomb,
         ("innovations", "nu.csv", b"2,3,1", b"2,inf,1", "nu.csv:2: landmark: expected a whole number >= -1, got inf"),
         ("innovations", "nu.csv", b"2,3,1", b"2,3,nan", "nu.csv:2: accepted: expected 0 or 1, got nan"),
         ("pgm", "map.yaml", b"map.pgm", b"m" * 1001, "map.yaml: image: expected the name of a file, got 'mmm"),
-        ("params", "params.json", b'"l_occ": ', b'"l_occ": "' + b"x" * 60_000 + b'", "x": ', "expected exactly"),
+        (
+            "params",
+            "params.json",
+            b'"l_occ": ',
+            b'"l_occ": "' + b"x" * 60_000 + b'", "x": ',
+            "l_occ: expected numbers, got 'xxx",
+        ),
         ("study", "parts/manifest.json", b'"runs": 30', b'"runs": 0', "whose manifest.json is damaged"),
         ("study", "parts/manifest.json", b'"runs": 30', b'"runs": "x"', "whose manifest.json is damaged"),
         ("study", "parts/manifest.json", b'"runs": 30', b'"walks": 30', "whose manifest.json is damaged"),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from jaxlocmap import GridSpec
 from jaxlocmap.mapping import grid, quality
+from jaxlocmap.types import Scanner
 
 L_OCC, L_FREE = 0.85, -0.40
 SPEC = GridSpec(origin=(-1.0, 0.5), resolution=0.25, shape=(16, 24))  # x from -1 to 5 m, y from 0.5 to 4.5 m
@@ -23,11 +24,13 @@ ANGLES = np.linspace(-1.2, 1.2, 9)
 POSE = np.array([0.63, 2.41, 0.3])
 
 
+def scanner(angles=ANGLES, min_range=MIN_RANGE, max_range=MAX_RANGE):
+    return Scanner(jnp.asarray(angles), min_range=min_range, max_range=max_range)
+
+
 @functools.partial(jax.jit, static_argnames="spec")
 def scanned(log_odds, pose, ranges, angles, l_occ=L_OCC, l_free=L_FREE, *, spec=SPEC):
-    return grid.update_log_odds(
-        log_odds, pose, ranges, angles, l_occ, l_free, spec=spec, min_range=MIN_RANGE, max_range=MAX_RANGE
-    )
+    return grid.update_log_odds(log_odds, pose, ranges, l_occ, l_free, scanner=scanner(angles), spec=spec)
 
 
 def scan(ranges, *, pose=POSE, angles=ANGLES, before=None):
@@ -207,11 +210,10 @@ def test_a_map_shorter_than_its_beams_is_cleared_from_edge_to_edge():
 @functools.partial(jax.jit, static_argnames=("at_the_end", "settled", "angles"))
 def mapped(log_odds, poses, ranges, l_occ=L_OCC, l_free=L_FREE, *, at_the_end=True, settled=True, angles=tuple(ANGLES)):
     """The map after several scans: each clamped, or only the last."""
-    limits = {"spec": SPEC, "min_range": MIN_RANGE, "max_range": MAX_RANGE}
     add = grid.add_scan if at_the_end else grid.update_log_odds
 
     def body(log_odds, now):
-        return add(log_odds, *now, jnp.array(angles), l_occ, l_free, **limits), None
+        return add(log_odds, *now, l_occ, l_free, scanner=scanner(angles), spec=SPEC), None
 
     log_odds, _ = jax.lax.scan(body, log_odds, (poses, ranges))
     return grid.clamp(log_odds, SPEC) if settled else log_odds
@@ -285,8 +287,7 @@ def batched(levels, args):
     """`add_scan` under one vmap a level, each over the arguments of the names it lists."""
 
     def one(args):
-        limits = {"spec": SPEC, "min_range": MIN_RANGE, "max_range": MAX_RANGE}
-        return grid.add_scan(**args, beam_angles=jnp.array(ANGLES), **limits)
+        return grid.add_scan(**args, scanner=scanner(), spec=SPEC)
 
     for names in reversed(levels):
         one = jax.vmap(one, in_axes=({name: 0 if name in names else None for name in BATCH},))
@@ -560,9 +561,10 @@ def test_an_update_of_the_wrong_shape_is_refused_by_name(change, message):
     """A map of another shape than the grid's would be written outside its bounds."""
     shapes = {"log_odds": (4, 4), "pose": (3,), "ranges": (2,), "beam_angles": (2,), "l_occ": (), "l_free": ()} | change
     arrays = {name: jnp.ones(shape) for name, shape in shapes.items()}
+    beams = scanner(arrays.pop("beam_angles"), min_range=0.1, max_range=3.0)
     spec = GridSpec(origin=(0.0, 0.0), resolution=1.0, shape=(4, 4))
     with pytest.raises(ValueError, match=message):
-        grid.update_log_odds(**arrays, spec=spec, min_range=0.1, max_range=3.0)
+        grid.update_log_odds(**arrays, scanner=beams, spec=spec)
 
 
 @pytest.mark.parametrize(
@@ -593,23 +595,25 @@ def test_scores_of_many_maps_are_refused_by_name():
 def test_a_grid_too_far_out_for_the_pose_s_precision_is_refused(origin):
     """The last one ends 4 m beyond where float32 counts in millimetres; float64 holds them all."""
     spec, scan = GridSpec(origin=origin, resolution=2.0, shape=(4, 4)), jnp.ones(2, jnp.float32)
-    maps = functools.partial(
-        grid.update_log_odds, jnp.zeros((4, 4), jnp.float32), spec=spec, min_range=0.1, max_range=3.0
-    )
+
+    def maps(pose, scan):
+        beams = scanner(scan, min_range=0.1, max_range=3.0)
+        return grid.update_log_odds(jnp.zeros((4, 4), jnp.float32), pose, scan, 0.8, -0.4, scanner=beams, spec=spec)
+
     with pytest.raises(ValueError, match=r"^grid: expected coordinates that float32 holds to 0\.001 m, got \d"):
-        jax.eval_shape(lambda pose: maps(pose, scan, scan, 0.8, -0.4), jnp.zeros(3, jnp.float32))
+        jax.eval_shape(lambda pose: maps(pose, scan), jnp.zeros(3, jnp.float32))
     if jnp.result_type(float) == jnp.float64:
         double = scan.astype(float)
-        jax.eval_shape(lambda pose: maps(pose, double, double, 0.8, -0.4), jnp.zeros(3))
+        jax.eval_shape(lambda pose: maps(pose, double), jnp.zeros(3))
 
 
 def test_a_batch_of_maps_with_more_cells_than_an_index_counts_is_refused():
     """While tracing: nothing of that size is made."""
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.1, shape=(2**10, 2**10))
-    limits = {"spec": spec, "min_range": 0.0, "max_range": 4.0}
+    beams = scanner(jnp.zeros(3), min_range=0.0, max_range=4.0)
 
     def one(log_odds, pose):
-        return grid.update_log_odds(log_odds, pose, jnp.ones(3), jnp.zeros(3), 1.0, -1.0, **limits)
+        return grid.update_log_odds(log_odds, pose, jnp.ones(3), 1.0, -1.0, scanner=beams, spec=spec)
 
     def shape(runs):
         given = (jax.ShapeDtypeStruct((runs, *shape), jnp.zeros(()).dtype) for shape in (spec.shape, (3,)))

@@ -8,11 +8,16 @@ import reference
 
 from jaxlocmap import GridSpec
 from jaxlocmap.mapping.predictive import BINS, predict_scans, scan_log_loss
+from jaxlocmap.types import Scanner
 
 SPEC = GridSpec(origin=(-1.0, -2.0), resolution=0.25, shape=(24, 20), l_min=-3.0, l_max=2.5)
 ANGLES = np.linspace(-1.5, 1.5, 7)
 LIMITS = {"min_range": 0.05, "max_range": 3.0}
 L_OCC, L_FREE = 0.9, -0.6
+
+
+def scanner():
+    return Scanner(jnp.asarray(ANGLES), **LIMITS)
 
 
 def drive(steps=9):
@@ -45,16 +50,15 @@ def in_plain_loops(l_occ, l_free, counted):
     return loss, cells, bins
 
 
-def foreseen(l_occ, l_free, counted, **kwargs):
+def predicted(l_occ, l_free, counted, **kwargs):
     poses, ranges = (jnp.asarray(x, jnp.result_type(float)) for x in drive())
-    angles = jnp.asarray(ANGLES, poses.dtype)
     amounts = (jnp.asarray(x, poses.dtype) for x in (l_occ, l_free))
-    return predict_scans(*amounts, poses, ranges, jnp.asarray(counted), angles, spec=SPEC, **LIMITS, **kwargs)
+    return predict_scans(*amounts, poses, ranges, jnp.asarray(counted), scanner=scanner(), spec=SPEC, **kwargs)
 
 
 @pytest.mark.parametrize("counted", [np.ones(9, bool), np.arange(9) >= 5])
 def test_it_is_what_plain_loops_give(counted, tolerance):
-    got = foreseen(L_OCC, L_FREE, counted)
+    got = predicted(L_OCC, L_FREE, counted)
     loss, cells, _ = in_plain_loops(L_OCC, L_FREE, counted)
     assert float(got.cells) == cells > 50
     assert not np.any(got[2:])
@@ -63,15 +67,15 @@ def test_it_is_what_plain_loops_give(counted, tolerance):
 
 def test_a_map_that_knows_nothing_pays_log_two_a_cell(tolerance):
     poses, ranges = drive()
-    args = (jnp.zeros(SPEC.shape), *map(jnp.asarray, (poses[0], ranges[0], ANGLES)))
-    loss, cells = jax.jit(lambda *args: scan_log_loss(*args, spec=SPEC, **LIMITS))(*args)
+    args = (jnp.zeros(SPEC.shape), *map(jnp.asarray, (poses[0], ranges[0])))
+    loss, cells = jax.jit(lambda *args: scan_log_loss(*args, scanner=scanner(), spec=SPEC))(*args)
     assert float(loss) == pytest.approx(float(cells) * np.log(2), rel=tolerance(1e-13, 1e-6))
 
 
 @pytest.mark.parametrize("counted", [np.ones(9, bool), np.arange(9) % 3 > 0])
 def test_bins_are_those_of_plain_loops(counted, tolerance):
     """Over the scans that count, in tenths of probability; what was never seen lies at 0.5, in the sixth."""
-    got = foreseen(L_OCC, L_FREE, counted, bins=True)
+    got = predicted(L_OCC, L_FREE, counted, bins=True)
     loss, cells, bins = in_plain_loops(L_OCC, L_FREE, counted)
     assert BINS == 10
     assert float(got.cells) == cells == bins[0].sum()
@@ -84,9 +88,9 @@ def test_bins_are_those_of_plain_loops(counted, tolerance):
 @pytest.mark.parametrize(("beyond", "bound"), [(99.0, 2.5), (-99.0, -3.0)])
 def test_what_lies_beyond_the_bounds_counts_as_at_them(beyond, bound):
     poses, ranges = drive()
-    args = tuple(map(jnp.asarray, (poses[0], ranges[0], ANGLES)))
+    args = tuple(map(jnp.asarray, (poses[0], ranges[0])))
     losses = [
-        jax.jit(lambda *a: scan_log_loss(*a, spec=SPEC, **LIMITS))(jnp.full(SPEC.shape, x), *args)
+        jax.jit(lambda *a: scan_log_loss(*a, scanner=scanner(), spec=SPEC))(jnp.full(SPEC.shape, x), *args)
         for x in (beyond, bound)
     ]
     assert losses[0] == losses[1]
@@ -94,7 +98,7 @@ def test_what_lies_beyond_the_bounds_counts_as_at_them(beyond, bound):
 
 def test_derivatives_are_those_of_the_loops(x64):
     counted, h = np.ones(9, bool), 1e-6
-    slope = jax.grad(lambda x: foreseen(x[0], x[1], counted).log_loss)(jnp.array([L_OCC, L_FREE]))
+    slope = jax.grad(lambda x: predicted(x[0], x[1], counted).log_loss)(jnp.array([L_OCC, L_FREE]))
     up, down = in_plain_loops(L_OCC + h, L_FREE, counted)[0], in_plain_loops(L_OCC - h, L_FREE, counted)[0]
     assert float(slope[0]) == pytest.approx((up - down) / (2 * h), rel=1e-6)
     up, down = in_plain_loops(L_OCC, L_FREE + h, counted)[0], in_plain_loops(L_OCC, L_FREE - h, counted)[0]
@@ -102,7 +106,7 @@ def test_derivatives_are_those_of_the_loops(x64):
 
 
 def test_shapes_that_do_not_fit_are_named():
-    amounts, angles = (jnp.array(0.9), jnp.array(-0.6)), jnp.asarray(ANGLES)
+    amounts = jnp.array(0.9), jnp.array(-0.6)
     poses, ranges = (jnp.asarray(x) for x in drive())
     with pytest.raises(ValueError, match=r"ranges: expected shape \(9, 7\), got \(8, 7\)"):
-        predict_scans(*amounts, poses, ranges[:8], jnp.ones(9, bool), angles, spec=SPEC, **LIMITS)
+        predict_scans(*amounts, poses, ranges[:8], jnp.ones(9, bool), scanner=scanner(), spec=SPEC)

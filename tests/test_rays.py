@@ -10,15 +10,20 @@ import reference
 
 from jaxlocmap import GridSpec
 from jaxlocmap.mapping import rays
+from jaxlocmap.types import Scanner
 
 # So long a reach that integers are divided, and one that float32 does for; where it cuts no beam both give the same.
 REACHES = {"float32": 70.0, "integers": 2000.0}
 both_forms = pytest.mark.parametrize("max_range", REACHES.values(), ids=REACHES)
 
 
+def scanner(angles, max_range, min_range=0.0):
+    return Scanner(angles, min_range=min_range, max_range=max_range)
+
+
 @functools.partial(jax.jit, static_argnames=("spec", "min_range", "max_range"))
 def cells(pose, ranges, angles, *, spec, min_range=0.0, max_range):
-    return rays.beam_cells(pose, ranges, angles, spec=spec, min_range=min_range, max_range=max_range)
+    return rays.beam_cells(pose, ranges, scanner(angles, max_range, min_range), spec=spec)
 
 
 def cells_to(ends, *, resolution, shape, start, max_range):
@@ -94,19 +99,18 @@ def test_beams_of_a_thousand_cells_are_bresenhams(reach):
     assert_bresenham(found, (0, 0), ends)
 
 
-def lines_of(span, n, exact):
-    """Lines that span so many cells along one axis, n along the other."""
-    slope, offset = rays._steps(jnp.stack([span, span]), n[None], exact)
-    whole = jnp.zeros_like(n)
-    return rays.Lines(jnp.zeros(2, jnp.int32), slope, offset, free=whole, last=whole)
-
-
 @pytest.mark.parametrize("n", [1, 30, 997, 1023, 1024])
 def test_float32_places_every_cell_where_integers_do(n):
     """Of all beams of n cells, to either side, up to the longest for which it is used."""
     m = jnp.arange(-n, n + 1, dtype=jnp.int32)
     many, j = jnp.full_like(m, n), jnp.arange(n + 1, dtype=jnp.int32)[None]
-    fast, slow = (jax.jit(rays._along, static_argnums=1)(lines_of(m, many, exact), 0, j) for exact in (True, False))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def along(exact):
+        """Of beams that span m cells along one axis, n along the other."""
+        return rays._steps(jnp.stack([m, m]), many, exact).along(0, j)
+
+    fast, slow = along(True), along(False)
     np.testing.assert_array_equal(fast, slow)
     x, y = abs(np.asarray(m, np.int64))[:, None], np.asarray(j, np.int64)
     np.testing.assert_array_equal(slow, np.sign(m)[:, None] * -((n - 2 * y * x) // (2 * n)))  # ceil(j m / n - 1/2)
@@ -154,7 +158,7 @@ def test_products_that_do_not_fit_are_divided_as_pythons_integers_are():
 
 @functools.partial(jax.jit, static_argnames=("spec", "max_range"))
 def some_cells(pose, ranges, angles, j, *, spec, max_range):
-    lines = rays.trace(pose, ranges, angles, spec=spec, min_range=0.0, max_range=max_range)
+    lines = rays.trace(pose, ranges, scanner(angles, max_range), spec=spec)
     return lines.free, lines.last, rays.cells_at(lines, j)
 
 
@@ -193,9 +197,10 @@ def test_a_very_long_beam_is_bresenhams(n):
 )
 def test_float32_is_for_beams_of_1024_cells_on_maps_of_2_to_the_24(reach, shape, exact):
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.5, shape=shape)
-    trace = functools.partial(rays.trace, spec=spec, min_range=0.0, max_range=reach * 0.5)
-    lines = jax.eval_shape(trace, jnp.zeros(3), jnp.zeros(2), jnp.zeros(2))
-    assert {lines.slope.dtype, lines.offset.dtype} == {jnp.dtype(jnp.float32 if exact else jnp.int32)}
+    trace = functools.partial(rays.trace, spec=spec)
+    lines = jax.eval_shape(trace, jnp.zeros(3), jnp.zeros(2), scanner(jnp.zeros(2), reach * 0.5))
+    assert isinstance(lines.steps, rays.Slopes if exact else rays.Spans)
+    assert {x.dtype for x in lines.steps} == {jnp.dtype(jnp.float32 if exact else jnp.int32)}
 
 
 @pytest.mark.usefixtures("x64")
@@ -217,7 +222,7 @@ def test_every_cell_of_a_beam_of_9000_cells_is_bresenhams():
 def test_beams_of_more_cells_than_can_be_counted_are_refused():
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.05, shape=(10, 10))
     with pytest.raises(ValueError, match=r"^max_range: expected beams of up to 1,048,576 cells, got 60000\.0 m"):
-        rays.trace(jnp.zeros(3), jnp.ones(2), jnp.zeros(2), spec=spec, min_range=0.0, max_range=6e4)
+        rays.trace(jnp.zeros(3), jnp.ones(2), scanner(jnp.zeros(2), 6e4), spec=spec)
 
 
 @pytest.mark.usefixtures("x64")
@@ -227,7 +232,7 @@ def test_flat_cells_are_rows_and_columns_also_of_a_map_too_large_for_float32():
 
     @jax.jit
     def both(pose, ranges, angles):
-        lines = rays.trace(pose, ranges, angles, spec=spec, min_range=0.0, max_range=5.0)
+        lines = rays.trace(pose, ranges, scanner(angles, 5.0), spec=spec)
         j = jnp.arange(6, dtype=jnp.int32)[None]
         return rays.cells_at(lines, j), rays.flat_cells(lines, j, spec)
 
@@ -288,11 +293,21 @@ def test_the_heading_turns_the_beams():
     jax.tree.map(np.testing.assert_array_equal, turned, straight)
 
 
+def test_a_scanner_off_the_centre_has_the_beams_of_one_where_it_sits():
+    pose, offset = np.array([2.1, 2.3, 0.8]), (0.4, -0.3, 1.9)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    there = pose + np.array([0.4 * c + 0.3 * s, 0.4 * s - 0.3 * c, 1.9])
+    ranges, angles = jnp.array([1.0, 1.7, 0.6]), jnp.array([0.3, -0.4, 2.0])
+    mounted = Scanner(angles, offset, min_range=0.0, max_range=4.0)
+    got = rays.beam_cells(jnp.array(pose), ranges, mounted, spec=SPEC)
+    jax.tree.map(np.testing.assert_array_equal, got, cells(jnp.array(there), ranges, angles, spec=SPEC, max_range=4.0))
+
+
 def test_shapes_that_do_not_fit_are_refused():
-    limits = {"spec": SPEC, "min_range": 0.0, "max_range": 4.0}
+    beams = scanner(jnp.zeros(3), 4.0)
     with pytest.raises(ValueError, match=r"^pose: expected shape \(3\), got \(2,\)"):
-        rays.beam_cells(jnp.zeros(2), jnp.ones(3), jnp.zeros(3), **limits)
+        rays.beam_cells(jnp.zeros(2), jnp.ones(3), beams, spec=SPEC)
     with pytest.raises(ValueError, match=r"^beam_angles: expected shape \(any\), got \(3, 1\)"):
-        rays.beam_cells(jnp.zeros(3), jnp.ones(3), jnp.zeros((3, 1)), **limits)
+        rays.beam_cells(jnp.zeros(3), jnp.ones(3), scanner(jnp.zeros((3, 1)), 4.0), spec=SPEC)
     with pytest.raises(ValueError, match=r"^ranges: expected shape \(3\), got \(2,\)"):
-        rays.trace(jnp.zeros(3), jnp.ones(2), jnp.zeros(3), **limits)
+        rays.trace(jnp.zeros(3), jnp.ones(2), beams, spec=SPEC)

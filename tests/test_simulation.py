@@ -13,9 +13,10 @@ import pytest
 import reference
 import scipy.stats
 from drives import like
+from jax.interpreters.partial_eval import dce_jaxpr
 
-from jaxlocmap import Config, Gaussian, GridSpec, se2, simulation
-from jaxlocmap._internal import random, trig
+from jaxlocmap import Config, Gaussian, GridSpec, se2, sensors, simulation
+from jaxlocmap._internal import random
 from jaxlocmap.simulation import CAPSTONE, LOOP, Detector, Noise, Scenario
 from jaxlocmap.simulation.world import World, occupancy, ray_cast, room
 
@@ -84,7 +85,7 @@ def test_given_the_course_s_random_numbers_the_drive_is_the_course_s(tolerance):
     truth, inputs = jax.jit(simulation.roll_out, static_argnames="scenario")(
         simulation.Draws(
             drive=jnp.array(np.column_stack([draws["heading"] / noise.heading, draws["control"] / [noise.v, noise.w]])),
-            sighting=jnp.array(draws["detector"] / [noise.range, noise.bearing]),
+            detection=jnp.array(draws["detector"] / [noise.range, noise.bearing]),
             scan=jnp.array(draws["scan"] / noise.scan),
         ),
         room(),
@@ -126,12 +127,17 @@ MADE_UP = Scenario(
     command=lambda k, pose: jnp.stack([1.0 + 0 * pose[0], 2.0 + 0 * pose[0]]),
     start=(1.0, 2.0, 3.0),
     prior_std=(0.1, 0.2, 0.3),
+    robot=Config(
+        dt=0.25,
+        max_range=3.0,
+        min_range=0.4,
+        grid=GridSpec((1.0, 2.0), 0.5, (3, 4)),
+        sensor_offset=(0.1, 0.2, 0.3),
+        scanner_offset=(0.4, 0.5, 0.6),
+    ),
+    detector=Detector(max_range=2.5, period=3),
     beams=5,
     half_view=0.6,
-    detector=Detector(max_range=2.5, period=3),
-    robot=Config(
-        dt=0.25, max_range=3.0, min_range=0.4, grid=GridSpec((1.0, 2.0), 0.5, (3, 4)), sensor_offset=(0.1, 0.2, 0.3)
-    ),
 )
 
 
@@ -146,6 +152,7 @@ def test_a_scenario_of_other_numbers_is_what_it_says():
         motion="euler",
         gate_probability=0.9,
         sensor_offset=(0.1, 0.2, 0.3),
+        scanner_offset=(0.4, 0.5, 0.6),
         grid=MADE_UP.robot.grid,
         min_range=0.4,
         max_range=3.0,
@@ -249,7 +256,7 @@ def test_a_drive_is_the_same_in_both_precisions():
 
 
 def test_no_two_uses_of_a_step_share_a_random_number(monkeypatch):
-    """Drive, every sighting with what makes it false, and scan take counters of their own, at every step."""
+    """Drive, every detection with what makes it false, and scan take counters of their own, at every step."""
     taken = []
 
     def recording(key, counter):
@@ -260,7 +267,7 @@ def test_no_two_uses_of_a_step_share_a_random_number(monkeypatch):
     monkeypatch.setattr(random, "threefry", recording)
     words, scenario = (0, 0), like(CAPSTONE, detector=dict(outliers=True))
     for k in (0, 1, 2**20, 2**30):
-        simulation.draw_drive(words, k, float)
+        simulation.draw_drive(words, k, scenario=scenario, dtype=float)
         for j in range(30):
             simulation.draw_detection(words, k, j, scenario=scenario, dtype=float)
         simulation.draw_scan(words, k, scenario=scenario, dtype=float)
@@ -393,7 +400,7 @@ def test_a_detector_off_the_centre_sees_from_where_it_sits(offset, tolerance):
     for turn in np.linspace(-3, 3, 7):
         mark = pose[:2] + 2.9 * np.array([np.cos(turn), np.sin(turn)])
         to = mark - sensor
-        z, near = simulation.detect(jnp.zeros(2), jnp.array(pose), jnp.array(mark), Noise(), scenario=scenario)
+        z, near = simulation.detect(jnp.zeros(2), jnp.array(pose), jnp.array(mark), room(), Noise(), scenario=scenario)
         assert bool(near) == (np.hypot(*to) < 3)
         np.testing.assert_allclose(z[0], np.hypot(*to), rtol=0, atol=tolerance(1e-12, 1e-5))
         turned = reference.wrap(float(z[1]) - (np.arctan2(to[1], to[0]) - pose[2] - dtheta))
@@ -401,21 +408,22 @@ def test_a_detector_off_the_centre_sees_from_where_it_sits(offset, tolerance):
 
 
 def test_a_detector_at_the_centre_costs_nothing():
-    """The same program, operation by operation, as one that knows of no offset."""
+    """The same program, operation by operation, as one that knows of no offset, nor of anything else it has not."""
 
     def centred(draws, pose, landmark):
         dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
-        distance = jnp.sqrt(dx * dx + dy * dy)
-        near = distance < SHORT.detector.max_range
+        near = jnp.sqrt(dx * dx + dy * dy) < SHORT.detector.max_range
+        distance, bearing = sensors.RANGE_BEARING.expected(pose, landmark)
         reach = distance + Noise().range * draws[0]
-        bearing = trig.arctan2(dy, dx) - pose[2] + Noise().bearing * draws[1]
-        return jnp.stack([reach, se2.wrap(bearing)]), near
+        return jnp.stack([reach, se2.wrap(bearing + Noise().bearing * draws[1])]), near
 
-    args = jnp.zeros(2), jnp.zeros(3), jnp.ones(2)
-    ours = jax.make_jaxpr(lambda *args: simulation.detect(*args, Noise(), scenario=SHORT))(*args)
-    assert sorted(eqn.primitive.name for eqn in ours.eqns) == sorted(
-        eqn.primitive.name for eqn in jax.make_jaxpr(centred)(*args).eqns
-    )
+    def operations(function):
+        program = jax.make_jaxpr(function)(jnp.zeros(2), jnp.zeros(3), jnp.ones(2)).jaxpr
+        needed, _ = dce_jaxpr(program, [True] * len(program.outvars))
+        return sorted(eqn.primitive.name for eqn in needed.eqns)
+
+    ours = operations(lambda *args: simulation.detect(*args, room(), Noise(), scenario=SHORT))
+    assert ours == operations(centred)
 
 
 # --- Another robot than the course's ---
@@ -433,7 +441,7 @@ OTHER = like(
 def test_a_drive_goes_by_the_robot_s_own_period_reach_and_looks(tolerance):
     """Without noise: a step of a quarter of a second, looks at steps 0 and 3 up to 3 m, a scan up to 2 m."""
     scenario = dataclasses.replace(OTHER, command=lambda k, pose: jnp.stack([1.0 + 0 * pose[0], 0.4 + 0 * pose[0]]))
-    none = Noise(*[0.0] * len(Noise._fields))
+    none = Noise(*[0.0] * (len(Noise._fields) - 1))
     draws = simulation.Draws(jnp.ones((6, 3)), jnp.ones((6, 4, 2)), jnp.ones((6, 5)))
     start = jnp.array([1.0, 9.0, 0.3])
     truth, inputs = simulation.roll_out(draws, room(), none, start, scenario=scenario)
@@ -466,7 +474,7 @@ def test_a_scan_s_noise_comes_after_the_cut_at_its_reach_and_ends_at_its_least_r
 def test_a_landmark_at_the_very_reach_is_not_seen():
     for reach, near in ((3.0, False), (np.nextafter(np.float32(3), np.float32(0)), True)):
         mark = jnp.array([float(reach), 0.0])
-        assert bool(simulation.detect(jnp.zeros(2), jnp.zeros(3), mark, Noise(), scenario=OTHER)[1]) is near
+        assert bool(simulation.detect(jnp.zeros(2), jnp.zeros(3), mark, room(), Noise(), scenario=OTHER)[1]) is near
 
 
 @pytest.mark.parametrize(("drawn", "false"), [(0.29, True), (0.31, False)])
@@ -474,7 +482,7 @@ def test_a_false_sighting_is_made_of_its_own_draws(drawn, false):
     """Anywhere within the robot's own reach, and all around; what is drawn decides whether it is one."""
     draws, noise = jnp.array([1.0, -1.0, drawn, 0.25, 0.875]), Noise(range=0.1, bearing=0.2, outlier_rate=0.3)
     scenario = like(OTHER, detector=dict(outliers=True))
-    z, near = simulation.detect(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), noise, scenario=scenario)
+    z, near = simulation.detect(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), room(), noise, scenario=scenario)
     assert near
     np.testing.assert_allclose(z, [0.75, 0.75 * np.pi] if false else [2.1, -0.2], rtol=1e-6)
 
@@ -509,7 +517,8 @@ def test_the_loop_is_two_laps_whose_true_start_is_drawn_from_the_prior():
 
 def test_the_robot_s_own_noise_as_a_filter_has_it():
     """The heading noise of a step is what a yaw rate's of 0.02 / 0.5 would be: with 0.03 rad/s a 3-4-5 triangle."""
-    params = simulation.own_params(Noise(heading=0.02, v=0.1, w=0.03, range=0.2, bearing=0.3), 0.5)
+    noise = Noise(heading=0.02, v=0.1, w=0.03, range=0.2, bearing=0.3)
+    params = simulation.own_params(noise, like(CAPSTONE, robot=dict(dt=0.5)))
     np.testing.assert_allclose(params.Q, np.diag([0.01, 0.05**2]), rtol=1e-6)
     np.testing.assert_allclose(params.R, np.diag([0.04, 0.09]), rtol=1e-6)
 
@@ -526,11 +535,17 @@ def test_every_word_of_a_key_makes_another_drive():
 # --- Shapes ---
 
 SHAPES = {
-    "drive": {"draws": (3,), "k": (), "pose": (3,), "heading": (), "v": (), "w": ()},
-    "sight": {"draws": (2,), "pose": (3,), "landmark": (2,), "range": (), "bearing": ()},
-    "simulate_scan": {"draws": (5,), "pose": (3,), "segments": (8, 2, 2), "scan": ()},
+    "drive": {"draws": (3,), "k": (), "state": (3,), "heading": (), "v": (), "w": ()},
+    "detect": {"draws": (2,), "state": (3,), "landmark": (2,), "range": (), "bearing": ()},
+    "simulate_scan": {"draws": (5,), "state": (3,), "segments": (8, 2, 2), "scan": ()},
     "draw_state": {"mean": (3,), "cov": (3, 3)},
     "simulate": {"start": (3,), "segments": (8, 2, 2), "landmarks": (4, 2), "v": ()},
+}
+# A state may have any length; what is said is what it does not fit.
+OF_A_SHORT_STATE = {
+    ("detect", "state", (1,)): r"pose: expected shape \(3\), got \(1,\)",
+    ("simulate_scan", "state", (1,)): r"pose: expected shape \(3\), got \(1,\)",
+    ("draw_state", "mean", (1,)): r"cov: expected shape \(1, 1\), got \(3, 3\)",
 }
 
 
@@ -541,18 +556,19 @@ def test_a_batch_is_refused_by_name(atom, name):
         noise = Noise(**{key: some.pop(key) for key in Noise._fields if key in some})
         world = World(some.pop("segments", jnp.ones((8, 2, 2))), some.pop("landmarks", jnp.ones((4, 2))))
         around = {"scenario": SHORT, "noise": noise}
-        if atom in ("simulate", "simulate_scan"):
+        if atom in ("simulate", "simulate_scan", "detect"):
             around["world"] = world
         if atom == "simulate":
             around["key"] = jax.random.key(0)
         if atom == "draw_state":
             some, around = {"prior": Gaussian(**some)}, {"key": jax.random.key(0)}
-        with pytest.raises(ValueError, match=rf"^(noise\.)?{name}: expected shape .*, got {re.escape(str(wrong))}"):
+        said = rf"(noise\.)?{name}: expected shape .*, got {re.escape(str(wrong))}"
+        with pytest.raises(ValueError, match="^" + OF_A_SHORT_STATE.get((atom, name, wrong), said)):
             getattr(simulation, atom)(**some, **around)
 
 
 def test_draws_for_another_detector_or_another_drive_are_refused():
-    args = jnp.zeros(3), jnp.ones(2), Noise()
+    args = jnp.zeros(3), jnp.ones(2), room(), Noise()
     with pytest.raises(ValueError, match=r"^draws: expected shape \(5\), got \(2,\)$"):
         simulation.detect(jnp.zeros(2), *args, scenario=FALSE)
     draws = simulation.Draws(jnp.zeros((13, 3)), jnp.zeros((12, 4, 2)))
@@ -560,9 +576,9 @@ def test_draws_for_another_detector_or_another_drive_are_refused():
         simulation.roll_out(draws, room(), Noise(), jnp.zeros(3), scenario=SHORT)
 
 
-@pytest.mark.parametrize("name", ["sighting", "scan"])
+@pytest.mark.parametrize("name", ["detection", "scan"])
 def test_draws_of_another_shape_are_refused_by_name(name):
-    shapes = {"drive": (12, 3), "sighting": (12, 4, 2), "scan": (12, 5)}
+    shapes = {"drive": (12, 3), "detection": (12, 4, 2), "scan": (12, 5)}
     for wrong in ((3, *shapes[name]), (*shapes[name][:-1], 1)):
         draws = simulation.Draws(**{key: jnp.zeros(shape) for key, shape in (shapes | {name: wrong}).items()})
         with pytest.raises(ValueError, match=rf"^draws\.{name}: expected shape .*, got {re.escape(str(wrong))}$"):
@@ -575,7 +591,7 @@ def test_random_numbers_are_those_of_one_step_and_one_landmark(steps):
     words, one, many = (0, 0), jnp.array(0), jnp.zeros(steps, int)
     kind = {"scenario": SHORT, "dtype": float}
     for name, draw in (
-        ("k", lambda: simulation.draw_drive(words, many, float)),
+        ("k", lambda: simulation.draw_drive(words, many, **kind)),
         ("k", lambda: simulation.draw_detection(words, many, one, **kind)),
         ("j", lambda: simulation.draw_detection(words, one, many, **kind)),
         ("k", lambda: simulation.draw_scan(words, many, **kind)),
@@ -609,7 +625,7 @@ def sighted(distance, noise, *, scenario, count):
 
     def one(k):
         draws = simulation.draw_detection(words, k, 2, scenario=scenario, dtype=float)
-        return simulation.detect(draws, pose, landmark, noise, scenario=scenario)
+        return simulation.detect(draws, pose, landmark, room(), noise, scenario=scenario)
 
     return jax.vmap(one)(jnp.arange(count))
 
@@ -665,7 +681,24 @@ def test_false_sightings_change_neither_the_drive_nor_what_is_true():
     assert not same[honest.valid].all()
 
 
-@pytest.mark.parametrize("name", ["steps", "sight_period", "beams"])
-def test_a_scenario_without_steps_looks_or_beams_is_refused(name):
+@pytest.mark.parametrize("name", ["steps", "beams"])
+def test_a_scenario_without_steps_or_beams_is_refused(name):
     with pytest.raises(ValueError, match=rf"^Scenario\.{name}: expected at least 1, got 0$"):
         dataclasses.replace(SHORT, **{name: 0})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"period": 0}, r"period: expected at least 1 step, got 0"),
+        ({"min_range": -0.1}, r"min_range, max_range: expected 0 <= min_range < max_range, got -0\.1, 7\.5"),
+        ({"min_range": 7.5}, r"min_range, max_range: expected 0 <= min_range < max_range, got 7\.5, 7\.5"),
+        ({"max_range": math.nan}, r"min_range, max_range: expected 0 <= min_range < max_range, got 0\.0, nan"),
+        ({"field_of_view": 0.0}, r"field_of_view: expected an angle in \(0, 2π\], got 0\.0"),
+        ({"field_of_view": 7.0}, r"field_of_view: expected an angle in \(0, 2π\], got 7\.0"),
+        ({"field_of_view": math.nan}, r"field_of_view: expected an angle in \(0, 2π\], got nan"),
+    ],
+)
+def test_a_detector_that_cannot_be_is_refused(change, message):
+    with pytest.raises(ValueError, match=rf"^Detector\.{message}$"):
+        like(SHORT, detector=dict(**change))

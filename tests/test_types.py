@@ -26,13 +26,13 @@ def test_from_std_squares_deviations(params):
     np.testing.assert_allclose(params.Q, np.diag([0.02**2, 0.03**2]), rtol=1e-6)
     np.testing.assert_allclose(params.R, np.diag([0.15**2, 0.03**2]), rtol=1e-6)
     np.testing.assert_allclose([params.l_occ, params.l_free], [0.7, -0.3], rtol=1e-6)
-    assert {x.dtype for x in params} == {jnp.result_type(float)}
+    assert {x.dtype for x in jax.tree.leaves(params)} == {jnp.result_type(float)}
 
 
 @pytest.mark.parametrize("value", [0.0, -0.1, math.nan, math.inf])
 @pytest.mark.parametrize("name", list(STD))
 def test_from_std_refuses_what_is_no_deviation(name, value):
-    with pytest.raises(ValueError, match=rf"^{name}: expected a positive, finite deviation, got {value}"):
+    with pytest.raises(ValueError, match=rf"^{name}: expected a positive, finite standard deviation, got {value}"):
         Params.from_std(**(STD | {name: value}))
 
 
@@ -48,7 +48,9 @@ def test_from_std_refuses_log_odds_of_the_wrong_sign(field, value, wanted):
 def test_parameters_come_back_from_disk_bit_for_bit(params, tmp_path):
     path = tmp_path / "params.json"
     params.save(path)
-    for got, expected in zip(Params.load(path), params, strict=True):
+    loaded = Params.load(path)
+    assert jax.tree.structure(loaded) == jax.tree.structure(params)
+    for got, expected in zip(jax.tree.leaves(loaded), jax.tree.leaves(params), strict=True):
         np.testing.assert_array_equal(got, expected)
         assert got.dtype == expected.dtype
 
@@ -72,8 +74,12 @@ def without(name):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (json.dumps(without("R")), r"expected exactly the fields .*'R'.*got \['Q', 'l_free', 'l_occ'\]"),
-        (json.dumps(GOOD | {"gate": 1}), r"expected exactly the fields .*got .*'gate'"),
+        (json.dumps(without("R")), r"expected the fields .*'R'.*got \['Q', 'l_free', 'l_occ'\]"),
+        (json.dumps(GOOD | {"gps": [[1, 2], [2, 1]]}), r"gps: expected a positive definite matrix, got eigenvalues"),
+        (json.dumps(GOOD | {"gps": [1.0, 1.0]}), r"gps: expected shape \(\), got \(2,\)"),
+        (json.dumps(GOOD | {"drift": math.nan}), r"drift: expected a finite number, got nan"),
+        (json.dumps(GOOD | {"drift": "none"}), r"drift: expected numbers, got 'none'"),
+        (json.dumps(GOOD | {"gate_probability": 1.5}), r"gate_probability: expected a probability in .* got 1\.5"),
         (
             json.dumps(GOOD | {"Q": [[1, 2], [2, 1]]}),
             r"Q: expected a positive definite matrix, got eigenvalues \[-1\.0",
@@ -90,7 +96,7 @@ def without(name):
         (json.dumps(GOOD | {"l_occ": "0.8"}), r"l_occ: expected numbers, got '0\.8'"),
         (json.dumps(GOOD | {"l_occ": None}), r"l_occ: expected numbers, got None"),
         (json.dumps(GOOD | {"l_occ": True}), r"l_occ: expected numbers, got True"),
-        (json.dumps([1, 2]), r"expected exactly the fields .*got list"),
+        (json.dumps([1, 2]), r"expected the fields .*got list"),
         ("Q = 1\n", r"expected a JSON object with \('Q', 'R', 'l_occ', 'l_free'\)"),
         ("", r"expected a JSON object"),
         (b"\xff\xfe\x00\x93NUMPY", r"expected a JSON object"),
@@ -104,6 +110,15 @@ def test_a_file_that_holds_no_parameters_is_refused_by_path_and_field(content, m
     assert str(raised.value).startswith(f"{path}: ")
 
 
+def test_a_field_of_another_name_is_a_block(tmp_path):
+    path = tmp_path / "params.json"
+    path.write_text(json.dumps(GOOD | {"gps": [[4.0, 0.5], [0.5, 1.0]], "drift": -2.5}))
+    params = Params.load(path)
+    assert params.blocks.keys() == {"gps", "drift"}
+    np.testing.assert_array_equal(params.blocks["gps"], [[4.0, 0.5], [0.5, 1.0]])
+    assert float(params.blocks["drift"]) == -2.5
+
+
 def test_a_file_that_is_not_there_says_so(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"missing\.json"):
         Params.load(tmp_path / "missing.json")
@@ -112,7 +127,7 @@ def test_a_file_that_is_not_there_says_so(tmp_path):
 
 
 def test_check_passes_what_is_traced_and_still_sees_shapes(params):
-    jax.jit(lambda p: p.check())(Params(*(-x for x in params)))
+    jax.jit(lambda p: p.check())(jax.tree.map(lambda x: -x, params))
     with pytest.raises(ValueError, match=r"Q: expected shape \(2, 2\), got \(3, 3\)"):
         jax.jit(lambda p: p.check())(params._replace(Q=jnp.eye(3)))
 
@@ -162,6 +177,8 @@ def test_a_grid_that_cannot_be_is_refused(change, message):
         ),
         ({"sensor_offset": (0.1, 0.2)}, r"sensor_offset: expected finite \(dx, dy, dtheta\), got \(0\.1, 0\.2\)"),
         ({"sensor_offset": (0.1, 0.2, math.inf)}, r"sensor_offset: expected .* got \(0\.1, 0\.2, inf\)"),
+        ({"scanner_offset": (0.1, 0.2)}, r"scanner_offset: expected finite \(dx, dy, dtheta\), got \(0\.1, 0\.2\)"),
+        ({"scanner_offset": (0.1, math.nan, 0.2)}, r"scanner_offset: expected .* got \(0\.1, nan, 0\.2\)"),
         ({"min_range": -0.1}, r"min_range, max_range: expected 0 <= min_range < max_range, got -0\.1, 8\.0"),
         ({"min_range": 8.0}, r"min_range, max_range: expected .* got 8\.0, 8\.0"),
         ({"max_range": math.inf}, r"min_range, max_range: expected .* got 0\.05, inf"),
@@ -173,9 +190,19 @@ def test_settings_that_cannot_be_are_refused(change, message):
         Config(**change)
 
 
-def test_a_gate_that_is_traced_is_not_looked_at():
-    gate = jax.jit(lambda p: dataclasses.replace(Config(), gate_probability=p).gate_probability)
-    assert gate(1.5) == 1.5
+def test_a_gate_that_is_traced_is_no_setting_but_a_parameter_and_not_looked_at(params):
+    with pytest.raises(TypeError, match=r"^gate_probability: expected a number, got "):
+        jax.eval_shape(lambda p: dataclasses.replace(Config(), gate_probability=p).gate_probability, 0.9)
+
+    def checked(p):
+        gated = params._replace(gate_probability=p)
+        gated.check()
+        return gated.gate_probability
+
+    assert jax.jit(checked)(1.5) == 1.5
+    with pytest.raises(ValueError, match=r"^gate_probability: expected .* in \(0, 1\], 1 for no gate, got 1\.5"):
+        checked(1.5)
+    assert checked(1.0) == 1.0
 
 
 def test_settings_are_values_equal_hashable_and_frozen():
@@ -228,6 +255,7 @@ def test_dtype_checks_see_through_jit():
         (GridSpec, {"l_max": "4"}, "l_max: expected a number, got '4'"),
         (Config, {"gate_probability": "0.99"}, r"gate_probability: expected a number, got '0\.99'"),
         (Config, {"sensor_offset": 0.2}, r"sensor_offset: expected a tuple of numbers, got 0\.2"),
+        (Config, {"scanner_offset": 0.2}, r"scanner_offset: expected a tuple of numbers, got 0\.2"),
     ],
 )
 def test_a_setting_that_is_no_number_is_named(record, change, message):
@@ -294,6 +322,8 @@ def test_settings_that_are_not_given_are_those_written_beside_them():
         grid=None,
         min_range=0.05,
         max_range=8.0,
+        scanner_offset=(0.0, 0.0, 0.0),
+        sensor="range_bearing",
     )
     assert GridSpec(**GRID) == GridSpec(**GRID, l_min=-4.0, l_max=4.0)
     params = Params.from_std(**STD)
