@@ -58,7 +58,7 @@ class LocalizeConfig:
     gate: float | None = 0.99
     """Probability with which a good observation passes the gate; None for no gate."""
     max_range: float | None = None
-    """Sightings at or beyond are left out, m."""
+    """Observations at or beyond are left out, m."""
     max_gap: float = MAX_GAP
     """The longest interval over which a command holds and truth is interpolated, s. In a longer gap of the odometry
     the robot is taken to stand."""
@@ -121,10 +121,10 @@ def time_sentences(log: Log, counts: Mapping[str, float], max_gap: float) -> lis
                 f"{repeated:,} of {stamps:,} stamps of the {what} repeat another, and the last of each counts: were "
                 f"they written with too few digits?"
             )
-    seen = log.sighting_time
+    seen = log.observation_time
     if len(seen) and not np.any((seen >= log.odometry_time.min()) & (seen <= log.odometry_time.max())):
         sentences.append(
-            f"sightings from {seen.min():.3f} to {seen.max():.3f} s, none in the time of the odometry, "
+            f"observations from {seen.min():.3f} to {seen.max():.3f} s, none in the time of the odometry, "
             f"{log.odometry_time.min():.3f} to {log.odometry_time.max():.3f} s: do their clocks differ?"
         )
     return sentences
@@ -167,7 +167,7 @@ def _piece(params: Params, state: State, inputs: Inputs, landmarks: jax.Array, *
 
 
 def filter_log(params: Params, prior: Gaussian, inputs: Inputs, landmarks: np.ndarray, config: Config) -> Info:
-    """`run`, in equal pieces so that a bar can move. The last is filled up with steps of no time and no sightings,
+    """`run`, in equal pieces so that a bar can move. The last is filled up with steps of no time and no observations,
     which change nothing.
     """
     steps = len(inputs.dt)
@@ -196,7 +196,7 @@ def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str,
         gate_probability=config.gate_probability,
     )
     nees = np.array(report["nees_per_step"])
-    at_sightings = nees[valid.any(axis=1) & np.isfinite(nees)]
+    at_observations = nees[valid.any(axis=1) & np.isfinite(nees)]
     flagged = int((~info.ok).sum())
     if not truth.any():
         report["verdict"] = "no verdict: the log has no truth to judge the covariance by"
@@ -213,7 +213,7 @@ def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str,
         "counts": timeline.counts,
         "left_out": report["counts"],
         "truth_share": float(truth.mean()),
-        "anees_at_sightings": float(at_sightings.mean()) if len(at_sightings) else math.nan,
+        "anees_at_observations": float(at_observations.mean()) if len(at_observations) else math.nan,
     }
 
 
@@ -250,7 +250,7 @@ def _print(report: dict[str, Any], judged: bool) -> None:
         rows += [
             ("steps with truth", f"{100 * report['truth_share']:.1f} %", ""),
             ("independent samples", readable(report["independent_samples"]), ""),
-            ("ANEES at sightings", readable(report["anees_at_sightings"]), "3"),
+            ("ANEES at observations", readable(report["anees_at_observations"]), "3"),
             ("median NEES", readable(report["nees_median"]), f"{consistency.chi2_quantile(0.5, 3):.2f}"),
             *pose_rows(report),
         ]

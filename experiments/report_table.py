@@ -22,7 +22,7 @@ def _brackets(limits: tuple[float, float], scale: float = 1) -> str:
 
 
 def pose_rows(report: dict[str, Any]) -> Rows:
-    """NEES and coverage, each axis, errors, and runs that lost the robot."""
+    """NEES and coverage, each axis, errors, and diverged runs."""
     rows = [
         ("ANEES (3 degrees)", readable(report["anees"], 4), band(report, "anees_band_95")),
         *(
@@ -46,7 +46,7 @@ def pose_rows(report: dict[str, Any]) -> Rows:
         *rows,
         ("position RMSE", f"{report['rmse_position_m']:.4g} m", ""),
         ("yaw RMSE", f"{report['rmse_yaw_rad']:.4g} rad", ""),
-        ("runs that lost the robot", str(report["diverged_runs"]), "0"),
+        ("diverged runs", str(report["diverged_runs"]), "0"),
     ]
 
 

@@ -61,7 +61,7 @@ class Swept(NamedTuple):
 
 
 def _scale(what: str, symbol: str, factors: np.ndarray, field: str, entry: int | None = None) -> Swept:
-    """A scale of a covariance the filter believes in, or of the deviation of one of its two entries."""
+    """A scale of a covariance the filter believes in, or of the standard deviation of one of its two entries."""
 
     def enter(cell: Cell, value: jax.Array) -> Cell:
         covariance = getattr(cell.params, field)
@@ -86,10 +86,10 @@ _FIGURES = (
 SWEPT = {
     "Q": _scale("covariance of speed and yaw rate", "Q", _SCALES, "Q"),
     "R": _scale("covariance of range and bearing", "R", _SCALES, "R"),
-    "sigma_v": _scale("deviation of the speed", "σ_v", _SCALES**0.5, "Q", 0),
-    "sigma_w": _scale("deviation of the yaw rate", "σ_ω", _SCALES**0.5, "Q", 1),
-    "sigma_range": _scale("deviation of the range", "σ_range", _SCALES**0.5, "R", 0),
-    "sigma_bearing": _scale("deviation of the bearing", "σ_bearing", _SCALES**0.5, "R", 1),
+    "sigma_v": _scale("standard deviation of the speed", "σ_v", _SCALES**0.5, "Q", 0),
+    "sigma_w": _scale("standard deviation of the yaw rate", "σ_ω", _SCALES**0.5, "Q", 1),
+    "sigma_range": _scale("standard deviation of the range", "σ_range", _SCALES**0.5, "R", 0),
+    "sigma_bearing": _scale("standard deviation of the bearing", "σ_bearing", _SCALES**0.5, "R", 1),
     "gate_probability": Swept(
         "gate: share of good observations it should let in [–], 1 is no gate",
         "gate {}",
@@ -315,7 +315,7 @@ def gate_verdict(other: str, rows: list[dict[str, Any]], runs: int) -> str:
     gain = (
         f"position RMSE {_rmse(best):.3g} m with gate {shown(best['gate_probability'])}, {_rmse(without):.3g} m without"
     )
-    lost = f"{best['diverged_runs']} of {runs} runs lost, {without['diverged_runs']} without"
+    lost = f"{best['diverged_runs']} of {runs} runs diverged, {without['diverged_runs']} without"
     return f"the gate buys most at {SWEPT[other].says.format(shown(row['value']))}: {gain}; {lost}"
 
 
@@ -343,7 +343,7 @@ def _print(report: dict[str, Any]) -> None:
 
 
 def _print_gate(other: str, rows: list[dict[str, Any]]) -> None:
-    headers = ("best gate", "position RMSE", "ANEES", "lost runs", "no gate: RMSE", "ANEES", "lost runs")
+    headers = ("best gate", "position RMSE", "ANEES", "diverged", "no gate: RMSE", "ANEES", "diverged")
     table = Table(other, *headers, title="What the gate buys", title_justify="left")
     for row in rows:
         gate = shown(row["best"]["gate_probability"])

@@ -36,7 +36,7 @@ from jaxlocmap.parameters import Q, R
 _CLOSE = 1e-4  # nats: two losses this close are the same, a tenth of what 512 runs leave uncertain
 _LOSSES = ("mse", "pose_nll", "innovation_nll", "nees", "nis")
 _TWO = ("range", "bearing")  # what `nees` and `nis` are tuned by, which tell no more than two
-_SURE = 1 / 3  # of the robot's own deviations: where the second comparison starts
+_SURE = 1 / 3  # of the robot's own standard deviations: where the second comparison starts
 _STEADY = simulation.LOOP  # whose prior is honest: an exact start would let a filter win that does not look
 
 

@@ -49,7 +49,7 @@ class TuneConfig:
     judge_gate: float | None = JUDGE_GATE
     """The gate the result is judged with."""
     max_range: float | None = None
-    """Of a log: sightings at or beyond are left out, m; of a laser, where its beams end, 20 m by default."""
+    """Of a log: observations at or beyond are left out, m; of a laser, where its beams end, 20 m by default."""
     max_gap: float | None = None
     """Of a woods or mrclam log: the longest interval over which a command holds and truth is interpolated, 1.5 s by
     default. In a longer gap of the odometry the robot is taken to stand."""

@@ -30,7 +30,7 @@ _HELD_OUT_WORLDS = 64
 _BLOCKS = 10  # of the scans of one map, for its standard errors
 
 # Steps that count in a window, and steps before them in which the filter forgets its start: 30 s each on woods, where
-# the filter remembers some 5 s; 45 s and 30 s on mrclam, where sightings are far between.
+# the filter remembers some 5 s; 45 s and 30 s on mrclam, where observations are far between.
 _WINDOWS = {"woods": (300, 300), "mrclam": (3000, 2000)}
 
 

@@ -224,7 +224,7 @@ def test_rows_of_the_pose():
         ("yaw within ±2σ", "92 % [87.5, 97]", "95.4 %"),
         ("position RMSE", "0.0123 m", ""),
         ("yaw RMSE", "0.0045 rad", ""),
-        ("runs that lost the robot", "6", "0"),
+        ("diverged runs", "6", "0"),
     ]
 
 

@@ -357,7 +357,7 @@ def test_what_the_linear_robot_is_tuned_by(monkeypatch, fits, quick, installed):
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_okf_gets_the_linear_robot_in_its_own_terms(monkeypatch, x64, quick):
-    """How far along x and which heading each sighting says; it tunes the noise of a step, ours is of a control."""
+    """How far along x and which heading each observation says; it tunes the noise of a step, ours is of a control."""
     monkeypatch.setattr(tune_compare, "_SEEN", (1e-3, 1e-5))
     train = tune_compare._linear_drives(np.random.default_rng(0), 3, 4)
     model = SimpleNamespace(get_Q=lambda: np.diag([0.25, 0.5]), get_R=lambda: np.diag([1.0, 2.0]))

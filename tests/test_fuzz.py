@@ -59,12 +59,12 @@ def sound_log(log):
         if isinstance(value, np.ndarray) and field.name != "scan":
             assert np.all(np.abs(value) <= 1e12), field.name
     assert log.odometry.shape == (len(log.odometry_time), 2)
-    assert log.sighting.shape == (len(log.sighting_time), 2)
+    assert log.observation.shape == (len(log.observation_time), 2)
     assert log.truth.shape == (len(log.truth_time), 3)
     assert log.scan.shape == (len(log.scan_time), len(log.beam_angles))
     assert np.all(np.isnan(log.scan) | (log.scan > 0))
-    assert np.all(log.sighting[:, 0] > 0)
-    assert np.all((log.sighting_landmark >= 0) & (log.sighting_landmark < len(log.landmarks)))
+    assert np.all(log.observation[:, 0] > 0)
+    assert np.all((log.observation_landmark >= 0) & (log.observation_landmark < len(log.landmarks)))
     assert np.all(np.diff(log.beam_angles) >= 0)
     assert log.scan_max_range > 0
     assert min(log.counts.values(), default=0) >= 0

@@ -167,7 +167,7 @@ def test_lag_one_pairs_each_observation_with_the_last_of_its_landmark_and_its_ba
 def test_lag_one_of_one_run_is_the_autocorrelation_and_its_band_holds_white_noise_alone(rho):
     rng = np.random.default_rng(5)
     steps, slots = 6000, 4
-    # Every landmark is seen at times of its own: the process runs over its sightings.
+    # Every landmark is seen at times of its own: the process runs over its observations.
     seen = rng.random((steps, slots)) < 0.5
     white = np.full((steps, slots, 2), np.nan)
     for j in range(slots):

@@ -26,15 +26,15 @@ OFFSET = (0.2, 0.1, 0.3)
 
 
 def made_log(**changed):
-    """Odometry every 0.1 s up to 3.9 s, a sighting every 0.5 s, 1 to 8 m away, truth from 0.5 s on."""
+    """Odometry every 0.1 s up to 3.9 s, a observation every 0.5 s, 1 to 8 m away, truth from 0.5 s on."""
     time, seen, known = np.arange(40) / 10, np.arange(8) / 2, np.arange(5, 40) / 10
     fields = {
         "landmarks": np.array([[4.0, 1.0], [1.0, 5.0]]),
         "odometry_time": time,
         "odometry": np.stack([0.5 + 0.1 * time, 0.1 * time], axis=1),
-        "sighting_time": seen,
-        "sighting_landmark": np.arange(8, dtype=np.int32) % 2,
-        "sighting": np.stack([1.0 + np.arange(8), np.full(8, 0.1)], axis=1),
+        "observation_time": seen,
+        "observation_landmark": np.arange(8, dtype=np.int32) % 2,
+        "observation": np.stack([1.0 + np.arange(8), np.full(8, 0.1)], axis=1),
         "truth_time": known,
         "truth": np.stack([known, 2 * known, 0.1 * known], axis=1),
         "sensor_offset": np.array(OFFSET),
@@ -127,7 +127,11 @@ def test_parameters_of_the_file_and_of_the_log(filtered, tmp_path):
 @pytest.mark.parametrize(
     ("changed", "options", "said"),
     [
-        ({"landmarks": np.zeros((0, 2)), "sighting_landmark": np.full(8, -1, np.int32)}, {}, "expected landmarks to"),
+        (
+            {"landmarks": np.zeros((0, 2)), "observation_landmark": np.full(8, -1, np.int32)},
+            {},
+            "expected landmarks to",
+        ),
         ({"truth_time": np.zeros(0), "truth": np.zeros((0, 3))}, {}, "has no truth to start from"),
         ({}, {"start": (0.0, math.nan, 0.0)}, "start: expected a finite pose"),
     ],
@@ -234,7 +238,7 @@ def test_the_report_of_a_log(monkeypatch):
         "verdict": "so so",
     }
     assert report["truth_share"] == pytest.approx(4 / 6)
-    assert report["anees_at_sightings"] == pytest.approx((2 + 9 + 6) / 3)
+    assert report["anees_at_observations"] == pytest.approx((2 + 9 + 6) / 3)
     assert (report["counts"], report["left_out"]) == ({"misreads": 2}, {"missing": 2})
 
 
@@ -247,10 +251,10 @@ def test_no_verdict_where_most_steps_are_flagged(monkeypatch, flagged, said):
     assert report["verdict"].startswith("no verdict: the log has no truth")
 
 
-def test_without_a_score_at_a_sighting_there_is_no_number(monkeypatch):
+def test_without_a_score_at_a_observation_there_is_no_number(monkeypatch):
     info, timeline, _ = made_info()
     report, *_ = judged(monkeypatch, timeline, info, nees_per_step=[1.0, math.nan, 2.0, math.nan, math.nan, 3.0])
-    assert math.isnan(report["anees_at_sightings"])
+    assert math.isnan(report["anees_at_observations"])
 
 
 COUNTS = {"odometry_gaps": 0, "odometry_gap_seconds": 0, "duplicate_truth": 0, "duplicate_odometry": 0}
@@ -265,14 +269,14 @@ COUNTS = {"odometry_gaps": 0, "odometry_gap_seconds": 0, "duplicate_truth": 0, "
         ({"duplicate_truth": 18}, {}, ["18 of 35 stamps of the truth repeat another"]),
         ({"duplicate_odometry": 20}, {}, []),  # of 40
         ({"duplicate_odometry": 21}, {}, ["21 of 40 stamps of the odometry repeat another"]),
-        ({}, {"sighting_time": np.arange(8) + 3.9}, []),  # the first at the last command
-        ({}, {"sighting_time": np.arange(8) - 7.0}, []),  # the last at the first
+        ({}, {"observation_time": np.arange(8) + 3.9}, []),  # the first at the last command
+        ({}, {"observation_time": np.arange(8) - 7.0}, []),  # the last at the first
         (
             {},
-            {"sighting_time": np.arange(8) + 4.0},
-            ["sightings from 4.000 to 11.000 s, none in the time"],
+            {"observation_time": np.arange(8) + 4.0},
+            ["observations from 4.000 to 11.000 s, none in the time"],
         ),
-        ({}, {"sighting_time": np.arange(8) - 7.5}, ["sightings from -7.500 to -0.500 s", "0.000 to 3.900 s"]),
+        ({}, {"observation_time": np.arange(8) - 7.5}, ["observations from -7.500 to -0.500 s", "0.000 to 3.900 s"]),
     ],
 )
 def test_what_looks_odd_in_a_log_s_time_is_said(counts, changed, said):
@@ -320,7 +324,7 @@ def test_what_is_shown(monkeypatch):
     monkeypatch.setattr(localize, "innovation_rows", lambda report: [("i", "", "")])
     monkeypatch.setattr(localize, "pose_rows", lambda report: [("p", "", "")])
     report = {"steps": 9, "observations": 8, "flagged_steps": 7, "truth_share": 0.655, "independent_samples": 44.4}
-    report |= {"anees_at_sightings": 3.5, "nees_median": 2.0, "log": "made", "counts": {"a": 1, "b": 0}}
+    report |= {"anees_at_observations": 3.5, "nees_median": 2.0, "log": "made", "counts": {"a": 1, "b": 0}}
     report |= {"left_out": {"missing": 5}}
     for judged in (True, False):
         localize._print(report, judged)
@@ -333,7 +337,7 @@ def test_what_is_shown(monkeypatch):
         *head,
         ("steps with truth", "65.5 %", ""),
         ("independent samples", "44.4", ""),
-        ("ANEES at sightings", "3.5", "3"),
+        ("ANEES at observations", "3.5", "3"),
         ("median NEES", "2", "2.37"),
         ("p", "", ""),
         *dropped,

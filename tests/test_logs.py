@@ -94,29 +94,29 @@ def test_mrclam(tmp_path, packed):
     np.testing.assert_array_equal(log.landmarks, [[1.5, -2.0], [3.0, 4.0]])
     np.testing.assert_array_equal(log.odometry_time, [1248444187.156, 1248444187.256])
     np.testing.assert_array_equal(log.odometry, [[0.1, 0.2], [0.3, -0.4]])
-    np.testing.assert_array_equal(log.sighting_landmark, [0, 1, 1])
-    assert log.sighting_landmark.dtype == np.int32
-    np.testing.assert_array_equal(log.sighting_time, [1248444187.2, 1248444187.2, 1248444187.3])
-    np.testing.assert_array_equal(log.sighting, [[1.5, 0.1], [2.5, -0.1], [2.4, -0.2]])
+    np.testing.assert_array_equal(log.observation_landmark, [0, 1, 1])
+    assert log.observation_landmark.dtype == np.int32
+    np.testing.assert_array_equal(log.observation_time, [1248444187.2, 1248444187.2, 1248444187.3])
+    np.testing.assert_array_equal(log.observation, [[1.5, 0.1], [2.5, -0.1], [2.4, -0.2]])
     np.testing.assert_array_equal(log.truth, [[0, 0, 3.1], [1, 2, -3.1]])
     assert log.counts == {
         "other_robots": 2,
         "unknown_barcodes": 1,
         "unmapped_landmarks": 1,
-        "bad_sightings": 1,
+        "bad_observations": 1,
     }
     assert log.scan.shape == (0, 0)
     assert log.stated_variance is None
 
 
-def test_mrclam_counts_each_kind_of_sighting_it_drops(tmp_path):
+def test_mrclam_counts_each_kind_of_observation_it_drops(tmp_path):
     """Of robots, misread, of a landmark without a place, without a range: one, two, three and four."""
     barcodes, ranges = [5, 77, 78, 99, 99, 99, 63, 63, 81, 81, 81], [1] * 6 + [0, -1, 0, -2, 3]
     rows = "".join(f"1248444187.3 {code} {reach} 0.5\n" for code, reach in zip(barcodes, ranges, strict=True))
     log = logs.read_mrclam(mrclam(tmp_path / "data", Robot1_Measurement=rows), 1)
-    kinds = ("other_robots", "unknown_barcodes", "unmapped_landmarks", "bad_sightings")
+    kinds = ("other_robots", "unknown_barcodes", "unmapped_landmarks", "bad_observations")
     assert [log.counts[kind] for kind in kinds] == [1, 2, 3, 4]
-    np.testing.assert_array_equal(log.sighting, [[3, 0.5]])
+    np.testing.assert_array_equal(log.observation, [[3, 0.5]])
 
 
 def test_mrclam_without_truth(tmp_path):
@@ -137,25 +137,25 @@ def test_woods(tmp_path, packed):
     # v[k] drove the robot from t[k-1] to t[k], so it is in force from t[k-1]; v[0] has no interval.
     np.testing.assert_array_equal(log.odometry_time, [0.0, 0.1, 0.2])
     np.testing.assert_array_equal(log.odometry, [[1, 0.1], [2, 0.2], [3, 0.3]])
-    np.testing.assert_array_equal(log.sighting_time, [0.0, 0.1, 0.3, 0.3])
-    np.testing.assert_array_equal(log.sighting_landmark, [0, 1, 0, 1])
-    np.testing.assert_array_equal(log.sighting, [[1, 0.1], [2, -0.2], [3, 0.3], [4, 0.4]])
+    np.testing.assert_array_equal(log.observation_time, [0.0, 0.1, 0.3, 0.3])
+    np.testing.assert_array_equal(log.observation_landmark, [0, 1, 0, 1])
+    np.testing.assert_array_equal(log.observation, [[1, 0.1], [2, -0.2], [3, 0.3], [4, 0.4]])
     np.testing.assert_array_equal(log.truth_time, [0.0, 0.1, 0.3])
     np.testing.assert_array_equal(log.truth, [[0, 0.5, 0], [1, 0.5, 0.1], [3, 0.5, 0.3]])
     np.testing.assert_array_equal(log.sensor_offset, [0.2, 0, 0])
     assert log.stated_variance == {"v": 3e-3, "w": 4e-3, "range": 1e-3, "bearing": 2e-3}
-    assert log.counts == {"odometry_without_interval": 1, "bad_sightings": 0, "invalid_truth": 1}
+    assert log.counts == {"odometry_without_interval": 1, "bad_observations": 0, "invalid_truth": 1}
     timeline = logs.to_timeline(log)
     np.testing.assert_allclose(timeline.inputs.dt, [0, 0.1, 0.1, 0.1], rtol=1e-15)
     np.testing.assert_array_equal(timeline.inputs.control[1:], [[1, 0.1], [2, 0.2], [3, 0.3]])
     np.testing.assert_array_equal(timeline.inputs.valid, [[1, 0], [1, 0], [0, 0], [1, 1]])
 
 
-def test_woods_counts_sightings_it_cannot_use(tmp_path):
+def test_woods_counts_observations_it_cannot_use(tmp_path):
     distance = np.array([[1.0, -1.0], [np.nan, 2.0], [0.0, np.inf], [3.0, 4.0]])
     log = logs.read_woods(woods(tmp_path / "log.mat", r=distance))
-    assert log.counts["bad_sightings"] == 3
-    np.testing.assert_array_equal(log.sighting[:, 0], [1, 2, 3, 4])
+    assert log.counts["bad_observations"] == 3
+    np.testing.assert_array_equal(log.observation[:, 0], [1, 2, 3, 4])
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -241,7 +241,7 @@ def test_a_bad_line_is_named(tmp_path, line, said):
     [
         ({"Robot1_Odometry": "# t v w\n"}, "Robot1_Odometry.dat: no rows"),
         ({"Robot1_Odometry": ""}, "Robot1_Odometry.dat: the file is empty"),
-        ({"Robot1_Measurement": "# t\n1.0 14 2.0 0.1\n"}, "no sighting of a landmark in 1 rows"),
+        ({"Robot1_Measurement": "# t\n1.0 14 2.0 0.1\n"}, "no observation of a landmark in 1 rows"),
         ({"Robot1_Measurement": "1.0 14.5 2.0 0.1\n"}, "Measurement.dat:1: barcode: expected a whole number"),
         ({"Barcodes": "6 63\n7 63\n"}, "barcode 63 is listed more than once"),
         ({"Barcodes": "6 63\n6 64\n"}, "subject 6 is listed more than once"),
@@ -450,19 +450,19 @@ def test_read_dispatch(tmp_path):
         ({"landmarks": np.full((1, 2), np.nan)}, "landmarks: expected finite values, got 2 others"),
         (
             {
-                "sighting_time": np.zeros(1),
-                "sighting_landmark": np.zeros(1, np.int32),
-                "sighting": np.ones((1, 2)),
+                "observation_time": np.zeros(1),
+                "observation_landmark": np.zeros(1, np.int32),
+                "observation": np.ones((1, 2)),
             },
-            "sighting_landmark: expected rows from -1 to -1, got 0 to 0",
+            "observation_landmark: expected rows from -1 to -1, got 0 to 0",
         ),
         (
             {
-                "sighting_time": np.zeros(1),
-                "sighting_landmark": np.full(1, -2, np.int32),
-                "sighting": np.ones((1, 2)),
+                "observation_time": np.zeros(1),
+                "observation_landmark": np.full(1, -2, np.int32),
+                "observation": np.ones((1, 2)),
             },
-            "sighting_landmark: expected rows from -1 to -1, got -2 to -2",
+            "observation_landmark: expected rows from -1 to -1, got -2 to -2",
         ),
         (
             {"truth_time": np.array([-1.1e12]), "truth": np.zeros((1, 3))},
@@ -477,10 +477,10 @@ def test_log_refuses_streams_that_do_not_fit(fields, said):
 # --- the timeline
 
 
-def log_of(odometry=(), sightings=(), scans=(), truth=(), landmarks=9):
+def log_of(odometry=(), observations=(), scans=(), truth=(), landmarks=9):
     """A log of rows: (t, v, w), (t, landmark, r, b), (t, ranges), (t, x, y, theta)."""
     odometry = np.array(odometry, float).reshape(-1, 3)
-    sightings = np.array(sightings, float).reshape(-1, 4)
+    observations = np.array(observations, float).reshape(-1, 4)
     truth = np.array(truth, float).reshape(-1, 4)
     beams = len(scans[0][1]) if scans else 0
     return logs.Log(
@@ -488,9 +488,9 @@ def log_of(odometry=(), sightings=(), scans=(), truth=(), landmarks=9):
         landmarks=np.zeros((landmarks, 2)),
         odometry_time=odometry[:, 0],
         odometry=odometry[:, 1:],
-        sighting_time=sightings[:, 0],
-        sighting_landmark=sightings[:, 1].astype(np.int32),
-        sighting=sightings[:, 2:],
+        observation_time=observations[:, 0],
+        observation_landmark=observations[:, 1].astype(np.int32),
+        observation=observations[:, 2:],
         scan_time=np.array([t for t, _ in scans], float),
         scan=np.array([ranges for _, ranges in scans], float).reshape(len(scans), beams),
         beam_angles=np.zeros(beams),
@@ -503,7 +503,7 @@ def log_of(odometry=(), sightings=(), scans=(), truth=(), landmarks=9):
 def test_timeline_by_hand():
     log = log_of(
         odometry=[(1.0, 0.1, 1), (2.0, 0.2, 2), (4.5, 0.3, 3)],
-        sightings=[(2.0, 3, 5, 0.5), (2.0, -1, 6, 0.6), (3.0, 4, 7, 0.7), (5.0, 5, 8, 0.8)],
+        observations=[(2.0, 3, 5, 0.5), (2.0, -1, 6, 0.6), (3.0, 4, 7, 0.7), (5.0, 5, 8, 0.8)],
         scans=[(3.0, [1.0, 2.0]), (4.0, [np.nan, 3.0])],
         truth=[(1.0, 0, 0, 0), (5.0, 4, 8, 1)],
     )
@@ -539,7 +539,7 @@ def test_timeline_of_odometry_alone():
 def test_backward_stamps_are_sorted_and_counted():
     log = log_of(
         odometry=[(2.0, 0.2, 0), (1.0, 0.1, 0), (3.0, 0.3, 0)],
-        sightings=[(2.5, 1, 1, 0), (1.5, 2, 1, 0), (1.5, 3, 1, 0)],
+        observations=[(2.5, 1, 1, 0), (1.5, 2, 1, 0), (1.5, 3, 1, 0)],
     )
     time, inputs, _, _, counts = logs.to_timeline(log)
     assert counts["backward_stamps"] == 2
@@ -552,12 +552,12 @@ def test_backward_stamps_are_sorted_and_counted():
 def test_duplicates():
     log = log_of(
         odometry=[(1, 0.1, 0), (2, 0.2, 0), (2, 0.25, 0), (4, 0.4, 0)],
-        sightings=[(3, 1, 5, 0.5), (3, 1, 5, 0.5), (3, 1, 5, 0.6), (3, 2, 5, 0.5), (4, 1, 5, 0.5)],
+        observations=[(3, 1, 5, 0.5), (3, 1, 5, 0.5), (3, 1, 5, 0.6), (3, 2, 5, 0.5), (4, 1, 5, 0.5)],
         scans=[(3, [1.0]), (3, [2.0])],
         truth=[(1, 0, 0, 0), (4, 9, 0, 0), (4, 3, 0, 0), (0, 0, 0, 0)],
     )
     time, inputs, truth, _, counts = logs.to_timeline(log, max_gap=9)
-    named = ("odometry", "sightings", "scans", "truth")
+    named = ("odometry", "observations", "scans", "truth")
     assert [counts[f"duplicate_{name}"] for name in named] == [1, 1, 1, 1]
     assert counts["backward_truth"] == 1
     np.testing.assert_array_equal(time, [1, 2, 3, 4])
@@ -571,7 +571,7 @@ def test_duplicates():
 def test_start_stop_and_what_is_dropped():
     log = log_of(
         odometry=[(1, 0.1, 0), (4, 0.4, 0)],
-        sightings=[(0.5, 1, 1, 0), (2, 1, 5, 0), (3, 1, 4.999, 0), (5, 1, 1, 0), (6, 1, 1, 0)],
+        observations=[(0.5, 1, 1, 0), (2, 1, 5, 0), (3, 1, 4.999, 0), (5, 1, 1, 0), (6, 1, 1, 0)],
         scans=[(0.0, [1.0]), (2.0, [2.0]), (3.0, [3.0])],
     )
     full = logs.to_timeline(log, max_range=5, max_gap=3)
@@ -637,17 +637,17 @@ values = st.integers(1, 3).map(float)
 @settings(max_examples=200, deadline=None)
 @given(
     odometry=st.lists(st.tuples(stamps, values, values), min_size=1, max_size=12),
-    sightings=st.lists(st.tuples(stamps, st.integers(-1, 2), values, values), max_size=20),
+    observations=st.lists(st.tuples(stamps, st.integers(-1, 2), values, values), max_size=20),
     scan_stamps=st.lists(stamps, max_size=5),
     max_range=st.sampled_from([None, 3.0]),
 )
-def test_timeline_keeps_everything_once(odometry, sightings, scan_stamps, max_range):
+def test_timeline_keeps_everything_once(odometry, observations, scan_stamps, max_range):
     """Against loops over the events; small whole numbers, so sums are exact and stamps often coincide."""
-    log = log_of(odometry, sightings, [(t, [t]) for t in scan_stamps])
+    log = log_of(odometry, observations, [(t, [t]) for t in scan_stamps])
     time, inputs, _, _, counts = logs.to_timeline(log, max_range=max_range, max_gap=13)
     command = {t: (v, w) for t, v, w in odometry}  # the last at a stamp wins
     first = min(command)
-    near = [s for s in dict.fromkeys(sightings) if max_range is None or s[2] < max_range]
+    near = [s for s in dict.fromkeys(observations) if max_range is None or s[2] < max_range]
     kept = [s for s in near if s[0] >= first]
     expected = sorted(set(command) | {s[0] for s in kept} | {t for t in scan_stamps if t >= first})
     assert time.tolist() == expected
@@ -663,8 +663,8 @@ def test_timeline_keeps_everything_once(odometry, sightings, scan_stamps, max_ra
     assert inputs.valid.shape[1] == max([1, *np.unique([s[0] for s in kept], return_counts=True)[1]])
     assert not np.any(inputs.z[~inputs.valid])
     assert not np.any(inputs.landmark[~inputs.valid])
-    assert counts["duplicate_sightings"] == len(sightings) - len(set(sightings))
-    assert counts.get("beyond_max_range", 0) == len(set(sightings)) - len(near)
+    assert counts["duplicate_observations"] == len(observations) - len(set(observations))
+    assert counts.get("beyond_max_range", 0) == len(set(observations)) - len(near)
     scans_kept = {t for t in scan_stamps if t >= first}
     assert counts["before_odometry"] == len(near) - len(kept) + len(set(scan_stamps)) - len(scans_kept)
     if scan_stamps:
@@ -751,7 +751,7 @@ def test_real_woods(data):
     assert len(log.truth) == 12609 - 331
     near = logs.to_timeline(log, max_range=5.0)
     assert near.inputs.valid.sum() == 61086 - near.counts["beyond_max_range"] == 58135
-    # Residuals from the true pose are what the file states, about 0.03 m and 0.026 rad, only if sightings,
+    # Residuals from the true pose are what the file states, about 0.03 m and 0.026 rad, only if observations,
     # landmarks, truth and the sensor's place all belong together.
     step, slot = np.nonzero(timeline.inputs.valid & timeline.truth_valid[:, None])
     pose, z = timeline.truth[step], timeline.inputs.z[step, slot]
@@ -769,7 +769,7 @@ def test_real_woods(data):
 
 
 @pytest.mark.parametrize(
-    ("robot", "steps", "sightings", "dropped"),
+    ("robot", "steps", "observations", "dropped"),
     [
         (1, 62750, 1534, 408),
         (2, 66853, 3239, 792),
@@ -778,11 +778,11 @@ def test_real_woods(data):
         (5, 62707, 4239, 1139),
     ],
 )
-def test_real_mrclam(data, robot, steps, sightings, dropped):
+def test_real_mrclam(data, robot, steps, observations, dropped):
     log = logs.read(data / "mrclam" / "MRCLAM_Dataset6", "mrclam", robot)
     timeline = logs.to_timeline(log)
     assert len(timeline.time) == steps
-    assert timeline.inputs.valid.sum() == sightings == len(log.sighting)
+    assert timeline.inputs.valid.sum() == observations == len(log.observation)
     assert timeline.counts["other_robots"] + timeline.counts["unknown_barcodes"] == dropped
     assert timeline.counts["backward_stamps"] == 0
     np.testing.assert_allclose(timeline.inputs.dt.sum(), timeline.time[-1] - timeline.time[0], rtol=1e-9)

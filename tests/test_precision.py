@@ -78,7 +78,7 @@ def test_the_other_two_filters_are_the_same_but_for_the_rounding_of_float32(outc
 
 
 def test_the_short_form_is_the_short_form():
-    """Of one sighting, as NumPy has it in float64; and its rounding is not mirrored, as that of Joseph's form is."""
+    """Of one observation, as NumPy has it in float64; and its rounding is not mirrored, as that of Joseph's form is."""
     inputs = precision.in_single(
         Inputs(
             dt=jnp.zeros(1),

@@ -385,10 +385,10 @@ def test_the_course_draws_are_those_of_its_seed():
     scenario = dataclasses.replace(simulation.CAPSTONE, steps=12)
     drawn = reference.course_draws(seed=9, steps=12)
     draws = capstone.course_draws(9, scenario, 4)
-    drive, sighting, scan = (np.asarray(x) for x in draws)
+    drive, observation, scan = (np.asarray(x) for x in draws)
     close = {"rtol": 1e-6}
     np.testing.assert_allclose(drive * [0.005, 0.02, 0.01], np.c_[drawn["heading"], drawn["control"]], **close)
-    np.testing.assert_allclose(sighting * [0.08, 0.02], np.nan_to_num(drawn["detector"]), **close)
+    np.testing.assert_allclose(observation * [0.08, 0.02], np.nan_to_num(drawn["detector"]), **close)
     np.testing.assert_allclose(scan * 0.03, drawn["scan"], **close)
 
 

@@ -318,25 +318,27 @@ def test_the_noise_of_drive_and_sensors_is_what_the_equations_say(capstones, tol
     for one, other in itertools.combinations(kicks, 2):
         assert_unrelated(one, other)
         assert_unrelated(one[:, :-1], other[:, 1:])
-    # Sightings of landmarks up to the detector's reach: a cut of what it measures would pick the short readings there.
+    # Observations of landmarks up to the detector's reach: a cut of what it measures would pick short readings.
     to = reference.COURSE_LANDMARKS - poses[:, :, None, :2]
     distance = np.hypot(to[..., 0], to[..., 1])
     sure = np.asarray(inputs.valid)
     bearing = np.arctan2(to[..., 1], to[..., 0]) - poses[..., None, 2]
-    sightings = [
+    observations = [
         (np.asarray(inputs.z[..., 0]) - distance) / noise.range,
         reference.wrap(np.asarray(inputs.z[..., 1]) - bearing) / noise.bearing,
     ]
-    for sighting in sightings:
-        assert_standard_normal(sighting[sure])
+    for observation in observations:
+        assert_standard_normal(observation[sure])
         both = sure[:, : -CAPSTONE.detector.period] & sure[:, CAPSTONE.detector.period :]
-        assert_unrelated(sighting[:, : -CAPSTONE.detector.period][both], sighting[:, CAPSTONE.detector.period :][both])
+        assert_unrelated(
+            observation[:, : -CAPSTONE.detector.period][both], observation[:, CAPSTONE.detector.period :][both]
+        )
         both = sure[..., 3] & sure[..., 1]
-        assert_unrelated(sighting[..., 3][both], sighting[..., 1][both])
-    assert_unrelated(*(sighting[sure] for sighting in sightings))
+        assert_unrelated(observation[..., 3][both], observation[..., 1][both])
+    assert_unrelated(*(observation[sure] for observation in observations))
     edge = sure & (distance > CAPSTONE.detector.max_range - noise.range)
     assert np.sum(edge) > 100
-    assert_standard_normal(sightings[0][edge])
+    assert_standard_normal(observations[0][edge])
     cast = jax.jit(jax.vmap(lambda pose: ray_cast(pose, CAPSTONE.beam_angles(), room().segments, 8.0)))
     run = slice(0, 20)
     exact = np.stack([cast(pose) for pose in truth.pose[run]])
@@ -478,7 +480,7 @@ def test_a_landmark_at_the_very_reach_is_not_seen():
 
 
 @pytest.mark.parametrize(("drawn", "false"), [(0.29, True), (0.31, False)])
-def test_a_false_sighting_is_made_of_its_own_draws(drawn, false):
+def test_a_false_observation_is_made_of_its_own_draws(drawn, false):
     """Anywhere within the robot's own reach, and all around; what is drawn decides whether it is one."""
     draws, noise = jnp.array([1.0, -1.0, drawn, 0.25, 0.875]), Noise(range=0.1, bearing=0.2, outlier_rate=0.3)
     scenario = like(OTHER, detector=dict(outliers=True))
@@ -630,7 +632,7 @@ def sighted(distance, noise, *, scenario, count):
     return jax.vmap(one)(jnp.arange(count))
 
 
-def test_false_sightings_are_even_over_reach_and_bearing():
+def test_false_observations_are_even_over_reach_and_bearing():
     """Whatever the landmark's own place is, and of one another."""
     z, valid = map(np.asarray, sighted(jnp.array(3.0), Noise(outlier_rate=1.0), scenario=FALSE, count=40_000))
     assert valid.all()
@@ -644,8 +646,8 @@ def test_false_sightings_are_even_over_reach_and_bearing():
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.1, 0.35])
-def test_the_share_of_false_sightings_is_the_rate(rate):
-    """A landmark out of reach is not reported, falsely or not; of one in reach the true sightings are as ever."""
+def test_the_share_of_false_observations_is_the_rate(rate):
+    """A landmark out of reach is not reported, falsely or not; of one in reach the true observations are as ever."""
     count, noise = 20_000, Noise(outlier_rate=rate)
     bound = scipy.stats.norm.isf(FAILURE / 2) * np.sqrt(count * rate * (1 - rate))
     _, valid = map(np.asarray, sighted(jnp.array(20.0), noise, scenario=FALSE, count=count))
@@ -661,7 +663,7 @@ def test_the_share_of_false_sightings_is_the_rate(rate):
         assert_standard_normal((z[~false] - [3.0, 0.0]) / [0.08, 0.02])  # being false is no matter of the noise
 
 
-def test_false_sightings_change_neither_the_drive_nor_what_is_true():
+def test_false_observations_change_neither_the_drive_nor_what_is_true():
     keys, worlds, noises, starts = settings_of_three()
     (truth, honest), (same_truth, some_false), (_, none_false) = (
         jax.tree.map(

@@ -214,7 +214,7 @@ def test_map_scores_are_there_only_with_a_grid(capstones, faulty):
 
 
 SHORT_CONFIG = SHORT.config(motion="euler")
-# Sightings that can be false, a sensor off the robot's centre, another period, and a gate that is a value.
+# Observations that can be false, a sensor off the robot's centre, another period, and a gate that is a value.
 LIED = like(
     LOOP,
     name="lied",
@@ -458,7 +458,7 @@ def test_a_gate_may_be_an_array_that_is_not_traced():
     jax.eval_shape(lambda key: behind(key, *args, gate), key)
 
 
-def test_sightings_are_false_as_often_as_they_are_said_to_be():
+def test_observations_are_false_as_often_as_they_are_said_to_be():
     """False ones lie anywhere in reach, so the gate of a filter that is about right refuses nearly all of them."""
     none, some = (lied(*lies((0.9999,) * 4, outlier_rate)) for outlier_rate in (0.0, 0.3))
     assert none.accepted.sum() == none.observed.sum()

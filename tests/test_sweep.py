@@ -252,7 +252,7 @@ def test_the_words_on_the_gate(rmse, expected):
 
 def test_the_words_on_the_gate_name_the_runs_lost():
     rows = sweep.what_the_gate_buys("outlier_rate", gate_cells((0.02, 0.03, 0.01, 0.3)))
-    assert sweep.gate_verdict("outlier_rate", rows, 50).endswith("1 of 50 runs lost, 3 without")
+    assert sweep.gate_verdict("outlier_rate", rows, 50).endswith("1 of 50 runs diverged, 3 without")
 
 
 def test_without_no_gate_there_is_nothing_to_compare_a_gate_with():

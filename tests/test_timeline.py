@@ -15,7 +15,7 @@ from jaxlocmap import Config, Gaussian, Params, init, logs, run
 from jaxlocmap.logs import timeline
 
 
-def log_of(odometry, sightings=(), truth=(), scans=()):
+def log_of(odometry, observations=(), truth=(), scans=()):
     """Stamps with a command each, stamps at which landmark 0 is seen, stamps of truth, stamps of scans."""
     odometry = np.array(odometry, float).reshape(-1, 3)
     return logs.Log(
@@ -23,9 +23,9 @@ def log_of(odometry, sightings=(), truth=(), scans=()):
         landmarks=np.zeros((1, 2)),
         odometry_time=odometry[:, 0],
         odometry=odometry[:, 1:],
-        sighting_time=np.array(sightings, float),
-        sighting_landmark=np.zeros(len(sightings), np.int32),
-        sighting=np.ones((len(sightings), 2)),
+        observation_time=np.array(observations, float),
+        observation_landmark=np.zeros(len(observations), np.int32),
+        observation=np.ones((len(observations), 2)),
         scan_time=np.array(scans, float),
         scan=np.ones((len(scans), 1)),
         beam_angles=np.zeros(1),
@@ -38,7 +38,7 @@ DRIVE = [(0.0, 1.0, 0.1), (0.5, 1.1, 0.2), (1.0, 1.2, 0.3), (9.0, 1.3, 0.4), (9.
 
 
 def test_in_a_gap_the_command_holds_for_a_period_and_then_the_robot_stands():
-    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE, sightings=[1.25, 4.0, 9.25]))
+    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE, observations=[1.25, 4.0, 9.25]))
     np.testing.assert_array_equal(time, [0, 0.5, 1, 1.25, 1.5, 4, 9, 9.25, 9.5])
     np.testing.assert_array_equal(inputs.control[1:, 0], [1.0, 1.1, 1.2, 1.2, 0, 0, 1.3, 1.3])
     np.testing.assert_array_equal(inputs.control[1:, 1], [0.1, 0.2, 0.3, 0.3, 0, 0, 0.4, 0.4])
@@ -48,7 +48,7 @@ def test_in_a_gap_the_command_holds_for_a_period_and_then_the_robot_stands():
 
 
 def test_after_the_last_command_the_robot_stands_too():
-    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE[:3], sightings=[1.25, 4.0], scans=[5.0]))
+    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE[:3], observations=[1.25, 4.0], scans=[5.0]))
     np.testing.assert_array_equal(time, [0, 0.5, 1, 1.25, 1.5, 4, 5])
     np.testing.assert_array_equal(inputs.control[1:, 0], [1.0, 1.1, 1.2, 1.2, 0, 0])
     assert (counts["odometry_gaps"], counts["odometry_gap_seconds"]) == (1, 3.5)
@@ -56,7 +56,7 @@ def test_after_the_last_command_the_robot_stands_too():
 
 @pytest.mark.parametrize("max_gap", [8.0, math.inf])
 def test_up_to_the_limit_a_command_holds(max_gap):
-    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE, sightings=[4.0]), max_gap=max_gap)
+    time, inputs, _, _, counts = logs.to_timeline(log_of(DRIVE, observations=[4.0]), max_gap=max_gap)
     np.testing.assert_array_equal(time, [0, 0.5, 1, 4, 9, 9.5])
     np.testing.assert_array_equal(inputs.control[1:, 0], [1.0, 1.1, 1.2, 1.2, 1.3])
     assert (counts["odometry_gaps"], counts["odometry_gap_seconds"]) == (0, 0)
@@ -73,7 +73,7 @@ def test_up_to_the_limit_a_command_holds(max_gap):
     ],
 )
 def test_only_the_gaps_between_start_and_stop_count(start, stop, time, speeds, seconds):
-    log = log_of(DRIVE, sightings=[1.25, 4.0, 9.25])
+    log = log_of(DRIVE, observations=[1.25, 4.0, 9.25])
     timeline = logs.to_timeline(log, start=start, stop=stop)
     np.testing.assert_array_equal(timeline.time, time)
     np.testing.assert_array_equal(timeline.inputs.control[1:, 0], speeds)
@@ -89,7 +89,7 @@ def test_odometry_slower_than_the_limit_is_refused():
 
 
 def test_one_command_holds_as_long_as_the_limit():
-    time, inputs, _, _, counts = logs.to_timeline(log_of([(0, 1, 0)], sightings=[1, 5]), max_gap=2)
+    time, inputs, _, _, counts = logs.to_timeline(log_of([(0, 1, 0)], observations=[1, 5]), max_gap=2)
     np.testing.assert_array_equal(time, [0, 1, 2, 5])
     np.testing.assert_array_equal(inputs.control[1:, 0], [1, 1, 0])
     assert counts["odometry_gap_seconds"] == 3
@@ -124,15 +124,15 @@ def test_streams_that_touch_overlap():
     assert logs.to_timeline(log_of(DRIVE, truth=[-1, 0])).truth_valid.sum() == 1
 
 
-# --- Many sightings at one stamp ---
+# --- Many observations at one stamp ---
 
 
 def crowd(seen):
-    """So many sightings at each stamp, of ranges 1, 2, 3 ... in order, and a scan and truth at every stamp."""
+    """So many observations at each stamp, of ranges 1, 2, 3 ... in order, and a scan and truth at every stamp."""
     stamps = np.arange(len(seen), dtype=float)
     log = log_of([(t, 1 + t, 0) for t in stamps], np.repeat(stamps, seen), truth=stamps, scans=stamps)
-    sighting = np.column_stack([1 + np.arange(sum(seen)), np.zeros(sum(seen))])
-    return dataclasses.replace(log, sighting=sighting.astype(float))
+    observation = np.column_stack([1 + np.arange(sum(seen)), np.zeros(sum(seen))])
+    return dataclasses.replace(log, observation=observation.astype(float))
 
 
 def test_a_crowd_at_one_stamp_takes_several_steps_of_no_length_and_little_memory():
@@ -146,7 +146,7 @@ def test_a_crowd_at_one_stamp_takes_several_steps_of_no_length_and_little_memory
     np.testing.assert_array_equal(np.cumsum(inputs.dt), time)
     np.testing.assert_array_equal(inputs.z[inputs.valid][:, 0], 1 + np.arange(sum(seen)))
     step, _ = np.nonzero(inputs.valid)
-    np.testing.assert_array_equal(time[step], log.sighting_time)
+    np.testing.assert_array_equal(time[step], log.observation_time)
     moves = inputs.dt > 0
     np.testing.assert_array_equal(inputs.control[moves, 0], 1 + np.arange(len(seen) - 1))
     # The scan and the truth belong to the pose that has seen all.
@@ -159,7 +159,7 @@ def test_a_crowd_at_one_stamp_takes_several_steps_of_no_length_and_little_memory
 
 def test_several_steps_of_a_stamp_give_the_belief_of_one(monkeypatch):
     log = crowd([0] * 200 + [40] + [0] * 200)
-    log = dataclasses.replace(log, landmarks=np.array([[3.0, 2.0]]), sighting=log.sighting * [0.1, 0] + [1, 0.5])
+    log = dataclasses.replace(log, landmarks=np.array([[3.0, 2.0]]), observation=log.observation * [0.1, 0] + [1, 0.5])
     config, params = Config(dt=1.0), Params.from_std(v=0.1, w=0.1, range=0.5, bearing=0.5)
     prior = Gaussian(jnp.zeros(3), jnp.eye(3) * 0.1)
 
@@ -197,7 +197,7 @@ def test_a_log_that_starts_in_a_crowd_starts_at_its_truth(programs):
 
 def test_what_lies_before_is_told_from_what_lies_after_and_a_stamp_at_the_limit_is_neither():
     seen, scans = [-2.0, -1.0, 0.5, 1.0, 1.25, 1.4], [-3.0, 0.25, 0.75, 1.25, 1.3]
-    log = log_of(DRIVE[:3], sightings=seen, scans=scans)
+    log = log_of(DRIVE[:3], observations=seen, scans=scans)
     timeline = logs.to_timeline(log, start=0.5, stop=1.25)
     np.testing.assert_array_equal(timeline.time, [0.5, 0.75, 1, 1.25])
     np.testing.assert_array_equal(timeline.inputs.valid[:, 0], [1, 0, 1, 1])
@@ -211,7 +211,9 @@ def test_what_lies_before_is_told_from_what_lies_after_and_a_stamp_at_the_limit_
 
 
 def test_stamps_that_go_back_count_in_every_stream():
-    log = log_of([DRIVE[0], DRIVE[2], DRIVE[1]], sightings=[1, 0.5, 0.25], scans=[4, 3, 2, 1], truth=[1, 0, 1, 0, 1, 0])
+    log = log_of(
+        [DRIVE[0], DRIVE[2], DRIVE[1]], observations=[1, 0.5, 0.25], scans=[4, 3, 2, 1], truth=[1, 0, 1, 0, 1, 0]
+    )
     counts = logs.to_timeline(log, max_gap=9.0).counts
     assert (counts["backward_stamps"], counts["backward_truth"]) == (1 + 2 + 3, 3)
 

@@ -207,7 +207,7 @@ def test_a_quick_run_takes_the_first_steps(monkeypatch, kind, steps):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"landmarks": np.zeros((0, 2)), "sighting_landmark": np.full(8, -1, np.int32)}, "expected landmarks"),
+        ({"landmarks": np.zeros((0, 2)), "observation_landmark": np.full(8, -1, np.int32)}, "expected landmarks"),
         ({"truth_time": np.zeros(0), "truth": np.zeros((0, 3))}, "expected a log with truth"),
     ],
 )

@@ -168,11 +168,11 @@ def _score_all(truth: jax.Array, mean: jax.Array, cov: jax.Array) -> PoseScore:
     return jax.vmap(jax.vmap(score_pose))(truth, mean, cov)
 
 
-def _diverged(known: np.ndarray, scored: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """Runs (N,) that lost the robot at any step, or whose belief at their last step with truth is none."""
+def _diverged(known: np.ndarray, scored: np.ndarray, diverged: np.ndarray) -> np.ndarray:
+    """Runs (N,) that diverged at any step, or whose belief at their last step with truth is none."""
     last = known.shape[1] - 1 - np.argmax(known[:, ::-1], axis=1)
     ended = scored[np.arange(len(known)), last]
-    return np.any(lost & scored, axis=1) | (known.any(1) & ~ended)
+    return np.any(diverged & scored, axis=1) | (known.any(1) & ~ended)
 
 
 def _over_runs(values: np.ndarray) -> np.ndarray:

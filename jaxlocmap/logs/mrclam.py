@@ -27,16 +27,16 @@ def read_mrclam(folder: str | Path, robot: int) -> Log:
         robot: its number, 1 to 5.
 
     Returns:
-        Log with landmarks in the order of their file, odometry, sightings, and truth or none. Counts of
-        sightings dropped: `other_robots` (a robot's barcode, its own included), `unknown_barcodes` (misreads:
-        not in the table), `unmapped_landmarks` (in the table, position not given), `bad_sightings` (range not
+        Log with landmarks in the order of their file, odometry, observations, and truth or none. Counts of
+        observations dropped: `other_robots` (a robot's barcode, its own included), `unknown_barcodes` (misreads:
+        not in the table), `unmapped_landmarks` (in the table, position not given), `bad_observations` (range not
         positive).
 
     Raises:
         FileNotFoundError: no such folder, or a file missing in it.
         ValueError: no such robot (the message names those there are), a line with missing, extra, non-numeric
             or non-finite columns (path and line), a file without rows, a subject or barcode listed twice, or
-            no sighting of a landmark at all.
+            no observation of a landmark at all.
 
     Source: Leung, Halpern, Barfoot and Liu, "The UTIAS multi-robot cooperative localization and mapping
     dataset", International Journal of Robotics Research 30(8), 2011.
@@ -82,11 +82,11 @@ def _read(folder: Path, robot: int) -> Log:
         "other_robots": int(np.sum(moving)),
         "unknown_barcodes": int(np.sum(unknown)),
         "unmapped_landmarks": int(np.sum(unmapped)),
-        "bad_sightings": int(np.sum(bad)),
+        "bad_observations": int(np.sum(bad)),
     }
     kept = ~(unknown | moving | unmapped | bad)
     if not np.any(kept):
-        raise ValueError(f"{seen_path}: no sighting of a landmark in {len(seen)} rows: dropped {counts}")
+        raise ValueError(f"{seen_path}: no observation of a landmark in {len(seen)} rows: dropped {counts}")
     try:
         truth_path = _find(folder, f"Robot{robot}_Groundtruth.dat")
     except FileNotFoundError:
@@ -98,9 +98,9 @@ def _read(folder: Path, robot: int) -> Log:
         landmarks=places[:, 1:3],
         odometry_time=odometry[:, 0],
         odometry=odometry[:, 1:],
-        sighting_time=seen[kept, 0],
-        sighting_landmark=row[kept],
-        sighting=seen[kept, 2:],
+        observation_time=seen[kept, 0],
+        observation_landmark=row[kept],
+        observation=seen[kept, 2:],
         truth_time=truth[:, 0],
         truth=truth[:, 1:],
         counts=counts,

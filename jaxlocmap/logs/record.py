@@ -30,7 +30,7 @@ class Log:
 
     Raises:
         ValueError: streams whose shapes do not belong together, a stamp or value that is not finite (`scan`
-            may hold NaN and infinity) or larger than 1e12, a sighting of a row that `landmarks` does not have, or a
+            may hold NaN and infinity) or larger than 1e12, a observation of a row that `landmarks` does not have, or a
             maximum range that is not positive.
     """
 
@@ -38,9 +38,9 @@ class Log:
     landmarks: np.ndarray = field(default_factory=_PAIRS)  # (L, 2) m, world frame
     odometry_time: np.ndarray = field(default_factory=_NUMBERS)  # (N,) s
     odometry: np.ndarray = field(default_factory=_PAIRS)  # (N, 2) v m/s, omega rad/s, in force until the next
-    sighting_time: np.ndarray = field(default_factory=_NUMBERS)  # (K,) s
-    sighting_landmark: np.ndarray = field(default_factory=_INTS)  # (K,) int32: row of `landmarks`, -1 unknown
-    sighting: np.ndarray = field(default_factory=_PAIRS)  # (K, 2) range m, bearing rad
+    observation_time: np.ndarray = field(default_factory=_NUMBERS)  # (K,) s
+    observation_landmark: np.ndarray = field(default_factory=_INTS)  # (K,) int32: row of `landmarks`, -1 unknown
+    observation: np.ndarray = field(default_factory=_PAIRS)  # (K, 2) range m, bearing rad
     scan_time: np.ndarray = field(default_factory=_NUMBERS)  # (S,) s
     scan: np.ndarray = field(default_factory=_SCANS)  # (S, B) m, inf: no return, NaN: no measurement
     scan_line: np.ndarray = field(default_factory=_INTS)  # (S,) int32: line of the file; (0,) where there are none
@@ -54,15 +54,15 @@ class Log:
     counts: dict[str, int] = field(default_factory=dict)  # what was dropped or repaired: how often
 
     def __post_init__(self) -> None:
-        stamps, sightings = len(self.odometry_time), len(self.sighting_time)
+        stamps, observations = len(self.odometry_time), len(self.observation_time)
         scans, beams, poses = len(self.scan_time), len(self.beam_angles), len(self.truth_time)
         for name, shape in (
             ("landmarks", (None, 2)),
             ("odometry_time", (stamps,)),
             ("odometry", (stamps, 2)),
-            ("sighting_time", (sightings,)),
-            ("sighting_landmark", (sightings,)),
-            ("sighting", (sightings, 2)),
+            ("observation_time", (observations,)),
+            ("observation_landmark", (observations,)),
+            ("observation", (observations, 2)),
             ("scan_time", (scans,)),
             ("scan", (scans, beams)),
             ("scan_line", (scans if len(self.scan_line) else 0,)),
@@ -80,9 +80,9 @@ class Log:
                 raise ValueError(f"{name}: expected numbers of a size up to {LARGEST:g}, got {size:g}")
         if not self.scan_max_range > 0:
             raise ValueError(f"scan_max_range: expected metres > 0, got {self.scan_max_range}")
-        rows = self.sighting_landmark
-        if sightings and not (rows.min() >= -1 and rows.max() < len(self.landmarks)):
+        rows = self.observation_landmark
+        if observations and not (rows.min() >= -1 and rows.max() < len(self.landmarks)):
             raise ValueError(
-                f"sighting_landmark: expected rows from -1 to {len(self.landmarks) - 1}, "
+                f"observation_landmark: expected rows from -1 to {len(self.landmarks) - 1}, "
                 f"got {rows.min()} to {rows.max()}"
             )

@@ -20,7 +20,7 @@ _WORTH = 8
 class Timeline(NamedTuple):
     """A log as steps, float64 NumPy. The prior of a filter is the belief at `time[0]`, since `dt[0]` is 0."""
 
-    time: np.ndarray  # (T,) s, increasing; steps that share the sightings of one stamp have the same
+    time: np.ndarray  # (T,) s, increasing; steps that share the observations of one stamp have the same
     inputs: Inputs  # of NumPy arrays; `ranges` (T, B) m, inf: no return, NaN: no measurement, or no scan at this step
     truth: np.ndarray  # (T, 3) m, m, rad at `time`, heading in [-pi, pi); NaN where not `truth_valid`
     truth_valid: np.ndarray  # (T,) bool; of the steps at one stamp only the last, which has seen all
@@ -35,28 +35,28 @@ def to_timeline(
     stop: float | None = None,
     max_gap: float = MAX_GAP,
 ) -> Timeline:
-    """Merge the streams of a log: one step for every distinct stamp of odometry, sighting or scan.
+    """Merge the streams of a log: one step for every distinct stamp of odometry, observation or scan.
 
     Step k moves the pose from the previous stamp to its own with the odometry in force in between, then
-    come its sightings, then its scan; `dt[k] >= 0`, and `dt[0]` is 0. Events at one stamp share a step, which
+    come its observations, then its scan; `dt[k] >= 0`, and `dt[0]` is 0. Events at one stamp share a step, which
     is the same as a step each with `dt` 0. In a gap of the odometry, an interval longer than `max_gap` or that long
     after its last stamp, the command holds for the usual period of the log (the median of its intervals); then the
     robot stands: a step of its own begins there, and the command is (0, 0) up to the next one, so that the covariance
-    grows by Q as in any other step. The number of slots M is the largest number of sightings at one stamp, at least 1;
-    unused slots hold landmark 0, z 0, valid False. Where that would
-    be a table of mostly unused slots (one stamp with thousands of sightings), M is smaller and such a stamp has several
-    steps, `dt` 0 from the second on and the scan in the last, which comes to the same.
+    grows by Q as in any other step. The number of slots M is the largest number of observations at one stamp, at least
+    1; unused slots hold landmark 0, z 0, valid False. Where that would be a table of mostly unused slots (one stamp
+    with thousands of observations), M is smaller and such a stamp has several steps, `dt` 0 from the second on and the
+    scan in the last, which comes to the same.
 
-    The counts of the log are joined by: `backward_stamps` (stamps of odometry, sightings and scans below the
+    The counts of the log are joined by: `backward_stamps` (stamps of odometry, observations and scans below the
     one before; sorted, ties in file order), `backward_truth` (the same for truth), `duplicate_odometry`,
-    `duplicate_scans`, `duplicate_truth` (same stamp; the last one wins), `duplicate_sightings` (same stamp,
-    landmark and values; one is kept), sightings or scans dropped: `beyond_max_range`, `before_odometry`
+    `duplicate_scans`, `duplicate_truth` (same stamp; the last one wins), `duplicate_observations` (same stamp,
+    landmark and values; one is kept), observations or scans dropped: `beyond_max_range`, `before_odometry`
     (before the first command the motion is unknown), `before_start`, `after_stop`; and the gaps among the steps:
     `odometry_gaps`, `odometry_gap_seconds` (how long the robot was taken to stand in them) and `truth_gaps`.
 
     Args:
         log: with odometry.
-        max_range: m; sightings at or beyond are dropped. None: all are kept.
+        max_range: m; observations at or beyond are dropped. None: all are kept.
         start: s; steps before are dropped, and the command then in force stays in force. To start from a
             known pose pass the first stamp of the truth.
         stop: s; steps after are dropped.
@@ -77,21 +77,21 @@ def to_timeline(
     if len(log.truth_time):
         check_overlap(log.name, log.truth_time, log.odometry_time, "odometry")
     counts: dict[str, float] = dict(log.counts)
-    streams = (log.odometry_time, log.sighting_time, log.scan_time)
+    streams = (log.odometry_time, log.observation_time, log.scan_time)
     counts["backward_stamps"] = sum(backward(stream) for stream in streams)
     odometry_rows = last_at_each_stamp(log.odometry_time)
     counts["duplicate_odometry"] = len(log.odometry_time) - len(odometry_rows)
     odometry_time, odometry = log.odometry_time[odometry_rows], log.odometry[odometry_rows]
-    sighting_rows = _distinct_sightings(log, counts)
+    observation_rows = _distinct_observations(log, counts)
     if max_range is not None:
-        near = log.sighting[sighting_rows, 0] < max_range
+        near = log.observation[observation_rows, 0] < max_range
         counts["beyond_max_range"] = int(np.sum(~near))
-        sighting_rows = sighting_rows[near]
+        observation_rows = observation_rows[near]
     scan_rows = last_at_each_stamp(log.scan_time)
     counts["duplicate_scans"] = len(log.scan_time) - len(scan_rows)
 
     first, last = _window(start, stop)
-    seen, scanned = log.sighting_time[sighting_rows], log.scan_time[scan_rows]
+    seen, scanned = log.observation_time[observation_rows], log.scan_time[scan_rows]
     both = np.concatenate([seen, scanned])
     begin = max(first, odometry_time[0])
     counts["before_odometry"] = int(np.sum(both < odometry_time[0]))
@@ -102,8 +102,8 @@ def to_timeline(
     time = time[(time >= begin) & (time <= last)]
     if not len(time):
         raise ValueError(f"{log.name}: no step between start {start} and stop {stop}")
-    sighting_rows = sighting_rows[(seen >= time[0]) & (seen <= time[-1])]
-    time, slots = _spread(time, log.sighting_time[sighting_rows])
+    observation_rows = observation_rows[(seen >= time[0]) & (seen <= time[-1])]
+    time, slots = _spread(time, log.observation_time[observation_rows])
     scan_rows = scan_rows[(scanned >= time[0]) & (scanned <= time[-1])]
 
     previous = np.concatenate([time[:1], time[:-1]])
@@ -113,7 +113,7 @@ def to_timeline(
     stood = stands & (time > previous)
     counts["odometry_gaps"] = len(np.unique(in_force[stood]))
     counts["odometry_gap_seconds"] = round(float(np.sum((time - previous)[stood])), 3)
-    landmark, z, valid = _fill(log, sighting_rows, time, slots)
+    landmark, z, valid = _fill(log, observation_rows, time, slots)
     ranges = None
     if len(log.scan_time):
         ranges = np.full((len(time), log.scan.shape[1]), np.nan)
@@ -152,7 +152,7 @@ def _stands_from(name: str, odometry_time: np.ndarray, last: float, max_gap: flo
     """Stamp (N,) from which the robot is taken to stand, the command being old; inf where the next one is in time.
 
     Args:
-        name: of the log. odometry_time: (N,) s, increasing. last: s, of the last sighting or scan.
+        name: of the log. odometry_time: (N,) s, increasing. last: s, of the last observation or scan.
     """
     intervals = np.diff(odometry_time)
     usual = float(np.median(intervals)) if len(intervals) else max_gap
@@ -177,13 +177,13 @@ def last_at_each_stamp(time: np.ndarray) -> np.ndarray:
     return order[keep]
 
 
-def _distinct_sightings(log: Log, counts: dict[str, float]) -> np.ndarray:
+def _distinct_observations(log: Log, counts: dict[str, float]) -> np.ndarray:
     """Rows in order of time, ties in file order, without exact repetitions."""
-    events = np.column_stack([log.sighting_time, log.sighting_landmark, log.sighting])
+    events = np.column_stack([log.observation_time, log.observation_landmark, log.observation])
     _, rows = np.unique(events, axis=0, return_index=True)
-    counts["duplicate_sightings"] = len(events) - len(rows)
+    counts["duplicate_observations"] = len(events) - len(rows)
     rows = np.sort(rows)
-    return rows[np.argsort(log.sighting_time[rows], kind="stable")]
+    return rows[np.argsort(log.observation_time[rows], kind="stable")]
 
 
 def _window(start: float | None, stop: float | None) -> tuple[float, float]:
@@ -198,14 +198,14 @@ def _spread(time: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, int]:
     """The stamps of the steps, some more than once if need be, and the number of slots M of each.
 
     Args:
-        time: (T,) s, strictly increasing. seen: (K,) s, of sightings, each in `time`.
+        time: (T,) s, strictly increasing. seen: (K,) s, of observations, each in `time`.
     """
-    sightings = np.bincount(np.searchsorted(time, seen), minlength=len(time))
+    observations = np.bincount(np.searchsorted(time, seen), minlength=len(time))
 
     def steps(slots: int) -> np.ndarray:
-        return np.maximum(-(-sightings // slots), 1)
+        return np.maximum(-(-observations // slots), 1)
 
-    most = max(int(sightings.max()), 1)
+    most = max(int(observations.max()), 1)
     choices = [most, *(2**i for i in range(most.bit_length()))]
     room = [int(steps(slots).sum()) * (slots + 1) for slots in choices]  # a step itself takes about as much as a slot
     best = int(np.argmin(room))
@@ -214,14 +214,14 @@ def _spread(time: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _fill(log: Log, rows: np.ndarray, time: np.ndarray, slots: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Put sightings, in order of time, into the slots of the steps: landmark (T, M), z (T, M, 2), valid (T, M)."""
-    first = np.searchsorted(time, log.sighting_time[rows])
+    """Put observations, in order of time, into the slots of the steps: landmark (T, M), z (T, M, 2), valid (T, M)."""
+    first = np.searchsorted(time, log.observation_time[rows])
     place = np.arange(len(rows)) - np.searchsorted(first, first)
     step, slot = first + place // slots, place % slots
     shape = (len(time), slots)
     landmark, z, valid = np.zeros(shape, np.int32), np.zeros((*shape, 2)), np.zeros(shape, bool)
-    landmark[step, slot] = log.sighting_landmark[rows]
-    z[step, slot] = log.sighting[rows]
+    landmark[step, slot] = log.observation_landmark[rows]
+    z[step, slot] = log.observation[rows]
     valid[step, slot] = True
     return landmark, z, valid
 

@@ -28,9 +28,9 @@ def read_woods(path: str | Path) -> Log:
         path: of the file, as it is or gzipped.
 
     Returns:
-        Log with sightings, odometry, truth where it is valid, `sensor_offset` (d, 0, 0) and
+        Log with observations, odometry, truth where it is valid, `sensor_offset` (d, 0, 0) and
         `stated_variance`.
-        Counts: `odometry_without_interval` (the first pair), `bad_sightings` (negative or non-finite),
+        Counts: `odometry_without_interval` (the first pair), `bad_observations` (negative or non-finite),
         `invalid_truth`.
 
     Raises:
@@ -71,9 +71,9 @@ def _log(path: str | Path, fields: dict[str, np.ndarray]) -> Log:
         landmarks=fields["l"],
         odometry_time=time[:-1],
         odometry=np.hstack([fields["v"], fields["om"]])[1:],
-        sighting_time=time[step],
-        sighting_landmark=row.astype(np.int32),
-        sighting=np.column_stack([distance[seen], bearing[seen]]),
+        observation_time=time[step],
+        observation_landmark=row.astype(np.int32),
+        observation=np.column_stack([distance[seen], bearing[seen]]),
         truth_time=time[valid],
         truth=pose[valid],
         sensor_offset=np.array([scalar["d"], 0.0, 0.0]),
@@ -85,7 +85,7 @@ def _log(path: str | Path, fields: dict[str, np.ndarray]) -> Log:
         },
         counts={
             "odometry_without_interval": 1,
-            "bad_sightings": int(np.sum(~seen & (distance != 0))),
+            "bad_observations": int(np.sum(~seen & (distance != 0))),
             "invalid_truth": int(np.sum(~valid)),
         },
     )

@@ -172,7 +172,7 @@ def sweep_figure(path: Path, report: dict[str, Any], labels: tuple[str, str], ti
         if min(rows, columns) > 1 and low < 0.8 * expected and high > 1.25 * expected:
             axes[0].contour(np.log(values / expected), levels=[0], colors="0.3", linestyles=style, linewidths=1.2)
             axes[0].plot([], [], style, color="0.3", lw=1.2, label=f"{label}, interpolated")
-    outlined, label = consistent > 0, "consistent: ANEES inside its 95 % band, no run lost"
+    outlined, label = consistent > 0, "consistent: ANEES inside its 95 % band, no run diverged"
     if not consistent.any():
         outlined, label = misfit == misfit.min(), "none is consistent: the best fit of ANEES and NIS"
     for ax in axes:

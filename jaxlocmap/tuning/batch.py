@@ -133,7 +133,7 @@ def windows(batch: Batch, length: int, *, run_in: int, beliefs: Gaussian) -> Bat
 
 def blocks(batch: Batch, count: int) -> Batch:
     """A batch of one sequence, `count` times, each time with another share of its counted steps: what
-    `certainty` compares where a sequence cannot be cut, such as one map.
+    `standard_errors` compares where a sequence cannot be cut, such as one map.
 
     Raises:
         ValueError: more than one sequence, or fewer counted steps than blocks.

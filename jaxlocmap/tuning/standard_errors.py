@@ -46,8 +46,8 @@ def standard_errors(objective: Objective, params: Params, batch: Batch, tuned: t
     finds the map that those before it have made. The Hessian leaves out the kinks at the bounds of a map's log-odds.
 
     An interval reaches as many standard errors as Student's t with N - 1 degrees says; along the logarithm, so that no
-    deviation comes out negative, but for correlations, which it keeps within ±1. From fewer than 20 sequences standard
-    errors tend to be too small all the same, and the words say so.
+    standard deviation comes out negative, but for correlations, which it keeps within ±1. From fewer than 20 sequences
+    standard errors tend to be too small all the same, and the words say so.
 
     Args:
         params: where the objective is at its minimum; where it is not, the words say so. batch: of at least two
