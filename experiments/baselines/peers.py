@@ -26,7 +26,7 @@ from jax.sharding import PartitionSpec as P
 
 import jaxlocmap
 from jaxlocmap import Config, Gaussian, Inputs, Params, consistency
-from jaxlocmap.motion import wrap
+from jaxlocmap.se2 import wrap
 
 DT, V, W = 0.1, 0.3, 0.1  # s, m/s, rad/s: a circle of 3 m
 LANDMARKS = np.array([[2.0, 10.0], [10.0, 2.5], [9.5, 10.5], [2.0, 5.5]])  # m
