@@ -21,7 +21,6 @@ from jaxlocmap.consistency import COVERAGE_LEVELS
 from jaxlocmap.consistency.scoring import NEES_EDGES, PHASES, Averages, Undiverged
 from jaxlocmap.consistency.study import MapTotals, Study, Totals, median_nees, pose_means, reference_study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.motion import EULER
 from jaxlocmap.simulation import CAPSTONE, LOOP, Noise
 
 # What the plant really does, seen by a first-order filter: the heading noise of a step is a yaw rate's as well.
@@ -903,7 +902,7 @@ def test_a_filter_that_is_told_the_truth_differs_in_nothing_else():
     config = dataclasses.replace(SHORT.config(motion="capstone", gate_probability=0.9), sensor_offset=(0.1, 0.2, 0.3))
     noise = Noise(heading=0.01, v=0.03, w=0.02, range=0.1, bearing=0.05)
     study, params = reference_study(SHORT, config, noise)
-    assert study == Study(SHORT, dataclasses.replace(config, motion=EULER, grid=None))
+    assert study == Study(SHORT, dataclasses.replace(config, motion="euler", grid=None))
     jax.tree.map(np.testing.assert_array_equal, params, simulation.own_params(noise, SHORT))
 
 

@@ -156,7 +156,7 @@ def own_params(noise: Noise, scenario: Scenario) -> Params:
     The heading noise that the course's plant adds to a step is what a yaw rate's would be that acts for its length.
     """
     blocks = {}
-    for block in (*own_motion(scenario).noise, sensors.resolve(scenario.robot.sensor).noise):
+    for block in (*motion.resolve(own_motion(scenario)).noise, sensors.resolve(scenario.robot.sensor).noise):
         std = [float(x) for x in noise.std(block)]
         if scenario.plant is None and block == Q:
             std[1] = math.hypot(std[1], float(noise.heading) / scenario.dt)
@@ -164,9 +164,9 @@ def own_params(noise: Noise, scenario: Scenario) -> Params:
     return Params.from_std(**blocks)
 
 
-def own_motion(scenario: Scenario) -> MotionModel:
-    """The plant's motion model: that of the course is `euler`."""
-    return motion.EULER if scenario.plant is None else scenario.plant
+def own_motion(scenario: Scenario) -> str | MotionModel:
+    """The plant's motion model, for `Config.motion`."""
+    return "euler" if scenario.plant is None else scenario.plant
 
 
 def _capstone_command(k: jax.Array, pose: jax.Array) -> jax.Array:
