@@ -112,11 +112,15 @@ def test_a_traced_gate_is_the_same_quantile_and_one_of_1_is_none(tolerance):
     np.testing.assert_allclose(got, scipy.stats.chi2.ppf(p, 2), rtol=tolerance(1e-12, 1e-5))  # 0.01 of a float32 0.99
 
 
-@pytest.mark.parametrize("dimension", [1, 3, 4, 7])
-def test_a_traced_gate_is_the_quantile_of_any_dimension(dimension, tolerance):
-    p = np.array([0.05, 0.5, 0.95, 0.99, 0.9999, 1.0])
-    got = jax.jit(lambda p: ekf.gate_threshold(p, dimension))(jnp.array(p))
-    np.testing.assert_allclose(got, scipy.stats.chi2.ppf(p, dimension), rtol=tolerance(1e-11, 1e-4))
+@pytest.mark.parametrize("dimension", [1, 3, 4, 7, 12])
+def test_a_traced_gate_is_the_quantile_of_any_dimension_far_out_on_both_sides(dimension, tolerance):
+    p = jnp.array([1e-6, 1e-3, 0.05, 0.4999, 0.5, 0.95, 0.99, 0.9999, 1 - 1e-6, 1.0])
+    got = jax.jit(lambda p: ekf.gate_threshold(p, dimension))(p)
+    below, above = (np.asarray(x, np.float64) for x in (p, 1 - p))
+    chi2 = scipy.stats.chi2(dimension)
+    np.testing.assert_allclose(
+        got, np.where(below < 0.5, chi2.ppf(below), chi2.isf(above)), rtol=tolerance(1e-11, 1e-5)
+    )
 
 
 def test_a_threshold_may_be_a_value_of_each_run():

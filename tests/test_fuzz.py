@@ -32,7 +32,7 @@ from test_logs import MRCLAM, woods
 from jaxlocmap import Params, logs
 from jaxlocmap.logs.matlab import read_matrices
 from jaxlocmap.mapping.ros import load_map
-from jaxlocmap.monte_carlo.checkpoint import Checkpoint, _owndigest
+from jaxlocmap.monte_carlo.checkpoint import Checkpoint, _own_digest
 from jaxlocmap.monte_carlo.lock import Lock
 
 INPUTS = int(os.environ.get("JAXLOCMAP_FUZZ", "2000"))
@@ -385,7 +385,7 @@ def sealed(name, data):
     if name.endswith("manifest.json"):
         try:
             found = json.loads(data)
-            found["digest"] = _owndigest({key: found[key] for key in found.keys() - {"made by", "digest"}})
+            found["digest"] = _own_digest({key: found[key] for key in found.keys() - {"made by", "digest"}})
             return json.dumps(found).encode()
         except (ValueError, AttributeError, RecursionError):
             return data

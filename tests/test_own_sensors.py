@@ -187,6 +187,11 @@ def test_a_detector_has_a_least_and_a_largest_range():
         assert detected([3.0, 9.0, 0.0], [3.0 + reach, 9.0], min_range=1.0, max_range=2.0) is seen
 
 
+def test_a_landmark_on_the_sensor_has_no_bearing_to_report():
+    assert detected([3.0, 9.0, 0.0], [3.0, 9.0]) is False
+    assert detected([3.0, 9.0, 0.0], [3.0, 9.0 + 1e-3]) is True
+
+
 @pytest.mark.parametrize(("landmark", "hidden"), [([9.0, 5.0], True), ([6.0, 9.0], False), ([4.5, 5.0], False)])
 def test_walls_hide_landmarks_if_asked(landmark, hidden):
     """The box from (4.5, 4) to (7.5, 6.5) stands between; what hangs on the wall that faces the robot is seen."""

@@ -62,13 +62,16 @@ def _chi2_quantile(probability: jax.Array, dimension: int) -> jax.Array:
         return -2 * jnp.log1p(-probability)
     if dimension == 1:
         return 2 * jax.scipy.special.erfinv(probability) ** 2
-    p = jnp.clip(probability, 1e-12, 1 - jnp.finfo(probability.dtype).epsneg)
-    half, spread = dimension / 2, 2 / (9 * dimension)
+    tiny, half, spread = jnp.finfo(probability.dtype).tiny, dimension / 2, 2 / (9 * dimension)
+    p, q = jnp.maximum(probability, tiny), jnp.maximum(1 - probability, tiny)
     x = dimension * (1 - spread + jax.scipy.special.ndtri(p) * math.sqrt(spread)) ** 3  # Wilson & Hilferty 1931
     x = jnp.maximum(x, 2 * (p * math.gamma(half + 1)) ** (1 / half))  # the first term of the series
-    for _ in range(6):  # Newton's steps, in the logarithm so that none leaves x > 0
+    for _ in range(5):  # Newton's steps on the logarithm of the smaller tail, which is all but straight
         density = jnp.exp((half - 1) * jnp.log(x / 2) - x / 2 - math.lgamma(half)) / 2
-        x = x * jnp.exp(-(jax.scipy.special.gammainc(half, x / 2) - p) / (density * x))
+        below, above = jax.scipy.special.gammainc(half, x / 2), jax.scipy.special.gammaincc(half, x / 2)
+        down = x * jnp.exp(-jnp.log(below / p) * below / (density * x))
+        up = x + jnp.log(above / q) * above / density
+        x = jnp.where(p < 0.5, down, up)
     return x
 
 

@@ -135,7 +135,8 @@ def detect(
     """What the robot's sensor makes of a landmark.
 
     Whether it reports one is decided by where the landmark truly is: a cut of what it measures would let through more
-    of the readings that came out short, and noise so picked is no longer the noise that it has.
+    of the readings that came out short, and noise so picked is no longer the noise that it has. A landmark on the sensor,
+    which has no bearing, is not reported.
 
     Args:
         draws: (m,) standard normals for the components of an observation; with `Detector.outliers` (2 m + 1,), then
@@ -167,7 +168,8 @@ def detect(
     z = jnp.stack([wrap(x) if i in sensor.angles else x for i, x in enumerate(z)])
     if not sensor.landmarks:
         return z, jnp.array(True)
-    return z, _is_detected(pose, landmark, world, scenario)
+    detected = _is_detected(pose, landmark, world, scenario)
+    return z, detected if sensor.defined is None else detected & sensor.defined(mounted, landmark)
 
 
 def _false(sensor: Sensor, i: int, exact: jax.Array, uniform: jax.Array, reach: float) -> jax.Array:
