@@ -135,8 +135,8 @@ def detect(
     """What the robot's sensor makes of a landmark.
 
     Whether it reports one is decided by where the landmark truly is: a cut of what it measures would let through more
-    of the readings that came out short, and noise so picked is no longer the noise that it has. A landmark on the sensor,
-    which has no bearing, is not reported.
+    of the readings that came out short, and noise so picked is no longer the noise that it has. A landmark on the
+    sensor, which has no bearing, is not reported.
 
     Args:
         draws: (m,) standard normals for the components of an observation; with `Detector.outliers` (2 m + 1,), then
