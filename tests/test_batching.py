@@ -12,6 +12,7 @@ import pytest
 from jax.sharding import Mesh, PartitionSpec
 
 from jaxlocmap._internal import batching
+from jaxlocmap._internal.linalg import SMALL
 
 
 class Carry(NamedTuple):
@@ -171,19 +172,20 @@ def test_small_arrays_travel_entry_by_entry_and_others_whole(monkeypatch):
 @pytest.mark.parametrize(
     ("shape", "small"),
     [
-        ((9,), True),
+        ((SMALL,), True),
         ((3, 3), True),
-        ((2, 5), True),
-        ((9, 9), True),
-        ((10,), False),
-        ((2, 10), False),
-        ((10, 2), False),
+        ((2, 4), True),
+        ((9, 1), True),
+        ((SMALL, SMALL), True),
+        ((SMALL + 1,), False),
+        ((SMALL + 1, SMALL + 1), False),
+        ((2, 5), False),
+        ((10, 1), False),
         ((0, 3), False),
         ((2, 2, 2), False),
     ],
 )
-def test_vectors_and_matrices_with_no_side_above_nine_are_small(shape, small):
-    """As the covariance of a pose is."""
+def test_what_is_small_is_a_state_its_covariance_or_no_larger_than_that_of_a_pose(shape, small):
     x = np.arange(np.prod(shape)).reshape(shape)
     parts, stack = batching.unstack([jnp.array(x)])
     assert [part.shape for part in parts] == ([()] * x.size if small else [shape])

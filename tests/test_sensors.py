@@ -123,8 +123,7 @@ WRONG.remove(("state", (4,)))  # it may be longer than a pose
 @pytest.mark.parametrize(("name", "wrong"), WRONG)
 def test_a_batch_is_refused_by_name(name, wrong):
     arrays = {key: jnp.ones(shape) for key, shape in SHAPES.items()} | {name: jnp.ones(wrong)}
-    said = "pose" if name == "state" and wrong == (1,) else name  # of a state, what it begins with
-    expected = rf"^{said}: expected shape .*, got {re.escape(str(wrong))}$"
+    expected = rf"^{name}: expected shape .*, got {re.escape(str(wrong))}$"
     with pytest.raises(ValueError, match=expected):
         sensors.linearise(**arrays)
     if name != "z":
