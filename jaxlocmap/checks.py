@@ -73,7 +73,8 @@ def resolved(name: str, value: Any, dtype: Any) -> None:
     """Raise if a type cannot hold coordinates to a millimetre.
 
     Args:
-        value: m, any shape. dtype: the floating-point type it is, or will be, held in.
+        value: m, any shape.
+        dtype: the floating-point type it is, or will be, held in.
 
     Raises:
         ValueError: a coordinate at which numbers of that type lie further apart.

@@ -51,10 +51,12 @@ def uniforms(key: Words, step: jax.Array, lane: Any, count: int, dtype: Any) -> 
     """Numbers (count,) evenly spread over (0, 1), neither end included.
 
     Args:
-        key: from `words_of`. step: () integer, >= 0. lane: () integer, >= 0, where to begin in what this key and step
-            have to give, so that uses apart take lanes apart (`lanes`).
-        count: how many. dtype: floating point; multiples of 2**-24 in all of them, so that the same key gives the same
-            numbers.
+        key: from `words_of`.
+        step: () integer, >= 0.
+        lane: () integer, >= 0, where to begin in what this key and step have to give, so that uses apart take lanes
+            apart (`lanes`).
+        count: how many.
+        dtype: floating point; multiples of 2**-24 in all of them, so that the same key gives the same numbers.
     """
     return _draw(lambda words: (_uniform(words[0], dtype), _uniform(words[1], dtype)), key, step, lane, count)
 

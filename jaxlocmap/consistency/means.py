@@ -48,7 +48,8 @@ def mean_over_runs(
     average; runs are independent, so the spread of the runs' averages does (batch means, Law 2015, section 9.5.3).
 
     Args:
-        total, total_square: sum over runs of the per-run average and of its square. runs: their number.
+        total, total_square: sum over runs of the per-run average and of its square.
+        runs: their number.
         expected: the value if the filter is consistent: for an average of χ² variables their degrees of freedom.
         variance: of a single value if the filter is consistent; by default that of χ², 2 * expected.
 
@@ -165,7 +166,8 @@ def mean_lag_one(total: np.ndarray, square: np.ndarray, runs: int, pairs: float)
 
     Args:
         total, square: (m,) sums over runs of the run's correlation and of its square, for each component.
-        runs: that have any pair. pairs: of all runs.
+        runs: that have any pair.
+        pairs: of all runs.
 
     Returns:
         (m,) the mean and (m,) half the width of its 95 % interval: from the spread between runs, of a single run

@@ -229,7 +229,8 @@ def gate_verdict(
     """What the share of observations the gate lets in says.
 
     Args:
-        accept_rate: share let in. nominal: the gate's probability; None: there is no gate.
+        accept_rate: share let in.
+        nominal: the gate's probability; None: there is no gate.
         observations: their number, for an interval of the share (binomial); without it nothing is called significant
             that is not large.
         longest_streak: of observations of one run that the gate refused one after the other.

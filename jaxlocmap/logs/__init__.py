@@ -41,7 +41,7 @@ def read(path: str | Path, format: str, robot: int | None = None, **scanner: Any
         path: a file for `woods` and `carmen`, a folder for `mrclam`.
         format: one of `FORMATS`.
         robot: its number, for `mrclam` only.
-        scanner: keywords of `read_carmen`, for `carmen` only.
+        **scanner: keywords of `read_carmen`, for `carmen` only.
 
     Raises:
         ValueError: an unknown format, `robot` missing for mrclam or given for another, `scanner` for another

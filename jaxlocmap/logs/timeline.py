@@ -136,7 +136,8 @@ def check_overlap(name: str, truth: np.ndarray, time: np.ndarray, what: str) -> 
     """Raise unless two clocks have some time in common.
 
     Args:
-        name: of the file. truth, time: s, in any order, of the truth and of `what`.
+        name: of the file.
+        truth, time: s, in any order, of the truth and of `what`.
 
     Raises:
         ValueError: they have none; says what each spans.
@@ -152,7 +153,9 @@ def _stands_from(name: str, odometry_time: np.ndarray, last: float, max_gap: flo
     """Stamp (N,) from which the robot is taken to stand, the command being old; inf where the next one is in time.
 
     Args:
-        name: of the log. odometry_time: (N,) s, increasing. last: s, of the last observation or scan.
+        name: of the log.
+        odometry_time: (N,) s, increasing.
+        last: s, of the last observation or scan.
     """
     intervals = np.diff(odometry_time)
     usual = float(np.median(intervals)) if len(intervals) else max_gap
@@ -198,7 +201,8 @@ def _spread(time: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, int]:
     """The stamps of the steps, some more than once if need be, and the number of slots M of each.
 
     Args:
-        time: (T,) s, strictly increasing. seen: (K,) s, of observations, each in `time`.
+        time: (T,) s, strictly increasing.
+        seen: (K,) s, of observations, each in `time`.
     """
     observations = np.bincount(np.searchsorted(time, seen), minlength=len(time))
 

@@ -176,8 +176,10 @@ def endpoint_covariance(
         J_ray = d endpoint / d pose,  J_sensor = d endpoint / d (range, angle)
 
     Args:
-        pose: (3,) m, m, rad. cov: (3, 3) of the pose.
-        reach: () m, the measured range. angle: () rad, the beam in the body frame.
+        pose: (3,) m, m, rad.
+        cov: (3, 3) of the pose.
+        reach: () m, the measured range.
+        angle: () rad, the beam in the body frame.
         R: (2, 2) m², rad², the beam's own noise; none by default.
 
     Returns:

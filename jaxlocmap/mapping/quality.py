@@ -40,7 +40,8 @@ def brier(log_odds: jax.Array, occupied: jax.Array, where: jax.Array) -> jax.Arr
     """Mean squared distance of the occupancy probability from the truth.
 
     Args:
-        log_odds: (rows, columns) nats. occupied: (rows, columns) bool, the known world.
+        log_odds: (rows, columns) nats.
+        occupied: (rows, columns) bool, the known world.
         where: (rows, columns) bool, the cells to score, `log_odds != 0` for those observed.
 
     Returns:
@@ -64,7 +65,9 @@ def calibration(log_odds: jax.Array, occupied: jax.Array, where: jax.Array, *, b
     """Reliability of the occupancy probabilities against a known world.
 
     Args:
-        log_odds: (rows, columns) nats. occupied: (rows, columns) bool. where: (rows, columns) bool, cells to score.
+        log_odds: (rows, columns) nats.
+        occupied: (rows, columns) bool.
+        where: (rows, columns) bool, cells to score.
         bins: number of equal bins of probability.
 
     Returns:

@@ -61,8 +61,10 @@ def save_map(
     """Write `name.pgm` and `name.yaml` for ROS map_server.
 
     Args:
-        folder: to write into, made if missing. name: of the files, without folder and suffix.
-        log_odds: (rows, columns) nats. spec: where the grid lies.
+        folder: to write into, made if missing.
+        name: of the files, without folder and suffix.
+        log_odds: (rows, columns) nats.
+        spec: where the grid lies.
         occupied_above, free_below: probabilities, as in `trinary`; map_server's defaults.
 
     Returns:

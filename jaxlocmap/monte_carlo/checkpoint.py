@@ -122,7 +122,8 @@ class Checkpoint:
         """Make the folder ready for a study.
 
         Args:
-            manifest: of the study. parts: numbers of those this process works on.
+            manifest: of the study.
+            parts: numbers of those this process works on.
 
         Returns:
             Those of `parts` that are finished and undamaged.

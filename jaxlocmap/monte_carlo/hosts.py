@@ -105,9 +105,10 @@ def join(
 
     Args:
         coordinator: "host:port" of process 0. It listens at that address alone if it is given as a number
-            (127.0.0.1:1234), at all addresses of its machine if by name. There is no password: whoever reaches the
-            port can join, so let that be in a network of your own.
-        processes: how many there are. process_id: which one this is, from 0.
+            (127.0.0.1:1234), at all addresses of its machine if by name. There is no password: whoever reaches the port
+            can join, so let that be in a network of your own.
+        processes: how many there are.
+        process_id: which one this is, from 0.
         timeout: s, how long the processes wait for each other.
 
     Raises:

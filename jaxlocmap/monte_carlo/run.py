@@ -59,17 +59,18 @@ def monte_carlo(
     In several processes (`hosts.join`) each computes its share on its own, and all return the whole.
 
     Args:
-        one_run: `(key, *args) -> pytree of arrays`. Hashable and equal by value (a function, or an instance of a
-            frozen dataclass), so that the same study is compiled once. It may have a method
-            `summed(key, counted, *args)` that returns the sum over the runs that are counted, by
-            `batching.sum_over_runs`: then sums come from that, and a run need not hold what is added up on the way.
-            It may also have a method `carried(key, *args)` that returns what its loop over time carries, of which
-            nothing but the shapes is looked at: a chunk is then made to work inside the cache.
-        key: of the whole study. runs: how many, >= 1.
+        one_run: `(key, *args) -> pytree of arrays`. Hashable and equal by value (a function, or an instance of a frozen
+            dataclass), so that the same study is compiled once. It may have a method `summed(key, counted, *args)` that
+            returns the sum over the runs that are counted, by `batching.sum_over_runs`: then sums come from that, and a
+            run need not hold what is added up on the way. It may also have a method `carried(key, *args)` that returns
+            what its loop over time carries, of which nothing but the shapes is looked at: a chunk is then made to work
+            inside the cache.
+        key: of the whole study.
+        runs: how many, >= 1.
         *args: pytrees of arrays handed to every run: parameters, the world. Changing their values compiles nothing.
-        chunk: runs that a device computes at once. Memory grows with it, not with `runs`. By default that of the
-            study to resume, else chosen by `chunks.choose`: the same in all processes, and on all machines for a run
-            that says what its loop carries, unless the runs make few turns of the devices, which are then made equal.
+        chunk: runs that a device computes at once. Memory grows with it, not with `runs`. By default that of the study
+            to resume, else chosen by `chunks.choose`: the same in all processes, and on all machines for a run that
+            says what its loop carries, unless the runs make few turns of the devices, which are then made equal.
         keep_runs: return each run's own values instead of their sums; in one process only.
         devices: of `jax.local_devices()`, all by default.
         progress: called with the number of runs done after each turn of the devices; in several processes, as if the

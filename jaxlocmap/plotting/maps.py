@@ -30,8 +30,11 @@ def trajectory_figure(
     """Path and truth from above, with ellipses that hold the position with the given probability.
 
     Args:
-        estimate: (T, 3) m, m, rad. cov: (T, 3, 3). truth: (T, 3), NaN where unknown; None without truth.
-        landmarks: (L, 2) m. segments: (S, 2, 2) m, walls.
+        estimate: (T, 3) m, m, rad.
+        cov: (T, 3, 3).
+        truth: (T, 3), NaN where unknown; None without truth.
+        landmarks: (L, 2) m.
+        segments: (S, 2, 2) m, walls.
     """
     figure = Figure(figsize=(8, 8), layout="constrained")
     ax = figure.subplots()
@@ -73,7 +76,9 @@ def map_figure(
     """Occupancy probability with the path driven; walls of a known world on top.
 
     Args:
-        log_odds: (rows, columns) nats. poses: (T, 3) m, m, rad, the path the map was made from. truth: (T, 3).
+        log_odds: (rows, columns) nats.
+        poses: (T, 3) m, m, rad, the path the map was made from.
+        truth: (T, 3).
     """
     figure = Figure(figsize=(9, 8), layout="constrained")
     ax = figure.subplots()

@@ -54,7 +54,9 @@ def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_r
     """Distance along each beam to the nearest wall, `max_range` where there is none.
 
     Args:
-        pose: (3,) m, m, rad. beam_angles: (B,) rad, body frame. segments: (S, 2, 2) m.
+        pose: (3,) m, m, rad.
+        beam_angles: (B,) rad, body frame.
+        segments: (S, 2, 2) m.
 
     Returns:
         (B,) m.

@@ -43,9 +43,12 @@ def sequence(
     """A batch of one sequence.
 
     Args:
-        inputs: leading axis T. prior: mean (3,), cov (3, 3). landmarks: (L, 2) m. truth: (T, 3) m, m, rad, of which
-            `known` (T,) says where it may be used: everywhere it is finite by default. beam_angles: (B,) rad.
-            poses: (T, 3) m, m, rad, where to map the scans.
+        inputs: leading axis T.
+        prior: mean (3,), cov (3, 3).
+        landmarks: (L, 2) m.
+        truth: (T, 3) m, m, rad, of which `known` (T,) says where it may be used: everywhere it is finite by default.
+        beam_angles: (B,) rad.
+        poses: (T, 3) m, m, rad, where to map the scans.
 
     Returns:
         `Batch` with N = 1. What does not fit is found by whatever uses it.
@@ -166,7 +169,10 @@ def simulated(
     """Simulated drives, N = runs.
 
     Args:
-        key: of the batch. world, noise: as their fields say. scenario: static. scans: with the laser.
+        key: of the batch.
+        world, noise: as their fields say.
+        scenario: static.
+        scans: with the laser.
         worlds: `world` leads with an axis of runs, a world each, whose landmarks are all the same.
     """
     prior = scenario.prior()

@@ -98,13 +98,16 @@ def fit(
     """Tune parameters for an objective.
 
     Args:
-        objective: what for. params: the start; what is not tuned stays. batch: to tune on.
+        objective: what for.
+        params: the start; what is not tuned stays.
+        batch: to tune on.
         tuned: which parameters, `parameters.names_of(objective.blocks)` being all.
-        optimiser: L-BFGS by default, which wants the whole batch at every step; with minibatches
-            `optax.adam(0.05)`: coordinates are logarithms, so that is 5 % a step.
+        optimiser: L-BFGS by default, which wants the whole batch at every step; with minibatches `optax.adam(0.05)`:
+            coordinates are logarithms, so that is 5 % a step.
         epochs: at most so many; after each the validation loss is taken and `progress` called.
         steps: of the optimiser in an epoch, one compiled scan.
-        minibatch: sequences a step, drawn anew without repetition; all by default. key: of the draws.
+        minibatch: sequences a step, drawn anew without repetition; all by default.
+        key: of the draws.
         validation: what the best is picked by; the batch itself by default.
         patience: stop after so many epochs in which the loss fell by less than `tolerance` of what it fell since the
             start.

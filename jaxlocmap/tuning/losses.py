@@ -65,7 +65,9 @@ def innovation_nll(params: Params, batch: Batch, *, config: Config) -> jax.Array
     does not see it: the innovations look right while the pose is over-confident. Then tune with truth.
 
     Args:
-        params: the filter's. batch: with observations. config: the filter's.
+        params: the filter's.
+        batch: with observations.
+        config: the filter's.
 
     Returns:
         () nats; NaN where nothing is observed. Source: Schweppe 1965 (the likelihood of innovations); Box & Tiao 1968
@@ -356,8 +358,11 @@ def predictive_score(
     """`predictive.predict_scans` over every sequence.
 
     Args:
-        l_occ, l_free: () nats, > 0 and < 0. batch: with scans. poses: (N, T, 3) m, m, rad, where to map them. config:
-            static, with a grid. bins: fill the bins too.
+        l_occ, l_free: () nats, > 0 and < 0.
+        batch: with scans.
+        poses: (N, T, 3) m, m, rad, where to map them.
+        config: static, with a grid.
+        bins: fill the bins too.
 
     Returns:
         `PredictiveScore` with a leading axis N.

@@ -50,8 +50,9 @@ def standard_errors(objective: Objective, params: Params, batch: Batch, tuned: t
     standard errors tend to be too small all the same, and the words say so.
 
     Args:
-        params: where the objective is at its minimum; where it is not, the words say so. batch: of at least two
-            sequences, what it was tuned on. tuned: which parameters.
+        params: where the objective is at its minimum; where it is not, the words say so.
+        batch: of at least two sequences, what it was tuned on.
+        tuned: which parameters.
 
     Raises:
         ValueError: fewer than two sequences, nothing to tune, or more than the losses tell (`Objective.check_tuned`).
