@@ -266,3 +266,7 @@ def test_settings_that_are_not_the_robots_are_refused():
         config = dataclasses.replace(simulation.CAPSTONE.config(grid=False), **{name: value})
         with pytest.raises(ValueError, match=rf"config\.{name}: expected that of the scenario"):
             simulation.CAPSTONE.check(config)
+    named = simulation.CAPSTONE.config(grid=False)
+    simulation.CAPSTONE.check(dataclasses.replace(named, sensor=sensors.RANGE_BEARING))
+    with pytest.raises(ValueError, match=r"config\.sensor: expected that of the scenario"):
+        simulation.CAPSTONE.check(dataclasses.replace(named, sensor=GPS))

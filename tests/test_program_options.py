@@ -15,7 +15,7 @@ import reference
 from drives import like
 from programs import Enough, Recorder, stop
 
-from jaxlocmap import Gaussian, Params, motion, simulation
+from jaxlocmap import Gaussian, Params, simulation
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import capstone
@@ -175,7 +175,7 @@ def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     assert not same_key(key, 3)
     expected = jax.random.fold_in(jax.random.key(3), 1)
     np.testing.assert_array_equal(jax.random.key_data(key), jax.random.key_data(expected))
-    assert (study.scenario, study.config.motion, study.config.grid) == (scenario, motion.EULER, None)
+    assert (study.scenario, study.config.motion, study.config.grid) == (scenario, "euler", None)
     assert study.config.gate_probability == 0.9
     np.testing.assert_array_equal(params.R, simulation.own_params(simulation.Noise(), scenario).R)
     assert how["devices"] == jax.local_devices()[:1]
