@@ -417,6 +417,7 @@ def test_a_detector_at_the_centre_costs_nothing():
         near = jnp.sqrt(dx * dx + dy * dy) < SHORT.detector.max_range
         distance, bearing = sensors.RANGE_BEARING.expected(pose, landmark)
         reach = distance + Noise().range * draws[0]
+        near = near & sensors.RANGE_BEARING.defined(pose, landmark)
         return jnp.stack([reach, se2.wrap(bearing + Noise().bearing * draws[1])]), near
 
     def operations(function):

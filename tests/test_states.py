@@ -60,12 +60,12 @@ def test_a_filter_that_knows_of_the_bias_is_consistent_and_one_that_does_not_is_
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 def test_the_drift_of_the_bias_is_tuned_to_within_two_standard_errors():
-    scenario = dataclasses.replace(SCENARIO, steps=300)
+    scenario = dataclasses.replace(SCENARIO, steps=200)
     config = scenario.config(motion=GYRO, gate_probability=None, grid=False)
     batch = tuning.simulated(jax.random.key(1), 48, simulation.room(), NOISE, scenario=scenario)
     objective = tuning.Objective(config, (("pose_nll", 1.0),))
     start = simulation.own_params(NOISE._replace(blocks={"gyro": 0.06}), scenario)
-    found = tuning.fit(objective, start, batch, tuned=("drift",), epochs=4)
+    found = tuning.fit(objective, start, batch, tuned=("drift",), epochs=3)
     sure = tuning.standard_errors(objective, found.params, batch, ("drift",))
     assert abs(sure.estimate[0] - 0.02) < 2 * sure.standard_error[0] < 0.01
     np.testing.assert_allclose(found.params.Q, start.Q, rtol=1e-12)  # through its coordinates and back
