@@ -415,8 +415,8 @@ def test_a_detector_at_the_centre_costs_nothing():
     def centred(draws, pose, landmark):
         dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
         near = jnp.sqrt(dx * dx + dy * dy) < SHORT.detector.max_range
-        distance, bearing = sensors.RANGE_BEARING.expected(pose, landmark)
-        reach = distance + Noise().range * draws[0]
+        exact = sensors.RANGE_BEARING.expected(pose, landmark)
+        reach, bearing = exact[0] + Noise().range * draws[0], exact[1]
         near = near & sensors.RANGE_BEARING.defined(pose, landmark)
         return jnp.stack([reach, se2.wrap(bearing + Noise().bearing * draws[1])]), near
 

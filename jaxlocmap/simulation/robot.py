@@ -185,6 +185,8 @@ def _is_detected(pose: jax.Array, landmark: jax.Array, world: World, scenario: S
     detected = distance < detector.max_range
     if detector.min_range > 0:
         detected = detected & (distance >= detector.min_range)
+    if detector.field_of_view == 2 * jnp.pi and not detector.occlusion:
+        return detected
     bearing = wrap(arctan2(dy, dx) - pose[2])
     if detector.field_of_view < 2 * jnp.pi:
         detected = detected & (jnp.abs(bearing) <= detector.field_of_view / 2)

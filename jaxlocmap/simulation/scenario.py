@@ -141,9 +141,8 @@ class Scenario:
         """
         for name in ("dt", "sensor", "sensor_offset", "scanner_offset", "min_range", "max_range"):
             ours, theirs = getattr(self.robot, name), getattr(config, name)
-            if name == "sensor":  # by its name or as a value
-                ours, theirs = sensors.resolve(ours), sensors.resolve(theirs)
-            if theirs != ours:
+            same = sensors.resolve(theirs) == sensors.resolve(ours) if name == "sensor" else theirs == ours
+            if not same:
                 raise ValueError(f"config.{name}: expected that of the scenario, {ours}, got {theirs}")
 
 
