@@ -88,7 +88,7 @@ class Precision:
     ) -> Outcome:
         """Scores of the drive that `key` stands for; all arguments in float64."""
         start_key, key = jax.random.split(key)
-        first = prior.mean if self.scenario.exact_prior else simulation.draw_state(start_key, prior)
+        first = simulation.draw_start(start_key, prior, scenario=self.scenario)
         drive = simulation.simulate(key, world, noise, first, scenario=self.scenario, scan=False)
         # Bin by bin, so that no filter's beliefs are kept for the whole drive.
         drive = jax.tree.map(lambda x: x.reshape(BINS, -1, *x.shape[1:]), drive)

@@ -178,7 +178,7 @@ class Single:
         """The true poses (T, 3) and the beliefs of the run that `key` stands for."""
         config = self.scenario.config(motion="euler", gate_probability=None, grid=False)
         start_key, key = jax.random.split(key)
-        start = prior.mean if self.scenario.exact_prior else simulation.draw_state(start_key, prior)
+        start = simulation.draw_start(start_key, prior, scenario=self.scenario)
         truth, inputs = simulation.simulate(key, world, noise, start, scenario=self.scenario, scan=False)
         state = init(prior, config=config)
         beliefs = run(params, state, inputs, landmarks=world.landmarks, config=config, collect=_belief)[1]

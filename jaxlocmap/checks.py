@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import jax.core
@@ -23,6 +24,17 @@ def number(name: str, value: Any) -> None:
     """
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{name}: expected a number, got {value!r}")
+
+
+def named(name: str, value: Any, table: Mapping[str, Any], other: str) -> Any:
+    """The entry of a table that `value` names.
+
+    Raises:
+        ValueError: it names none; `other` is what may stand in the place of a name.
+    """
+    if value not in table:
+        raise ValueError(f"{name}: expected one of {sorted(table)} or {other}, got {value!r}")
+    return table[value]
 
 
 def shape(name: str, value: Any, expected: tuple[int | None, ...]) -> None:

@@ -172,11 +172,7 @@ def resolve(model: str | MotionModel) -> MotionModel:
     Raises:
         ValueError: an unknown name.
     """
-    if isinstance(model, MotionModel):
-        return model
-    if model not in MODELS:
-        raise ValueError(f"motion: expected one of {sorted(MODELS)} or a MotionModel, got {model!r}")
-    return MODELS[model]
+    return model if isinstance(model, MotionModel) else checks.named("motion", model, MODELS, "a MotionModel")
 
 
 def from_wheels(left: jax.Array, right: jax.Array, wheel_base: float, *, gyro: jax.Array | None = None) -> jax.Array:

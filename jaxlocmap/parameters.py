@@ -42,7 +42,6 @@ Q = Block("Q", ("v", "w"), ("m/s", "rad/s"))
 R = Block("R", ("range", "bearing"), ("m", "rad"))
 L_OCC = Block("l_occ", ("l_occ",), ("nats",), "positive")
 L_FREE = Block("l_free", ("l_free",), ("nats",), "negative")
-SENSOR_MODEL = (L_OCC, L_FREE)
 
 
 class Params(NamedTuple):

@@ -16,9 +16,10 @@ import numpy as np
 from jaxlocmap import checks, motion, sensors
 from jaxlocmap._internal.batching import any_in_batch, cond, scan
 from jaxlocmap.mapping import grid
+from jaxlocmap.parameters import Params
 from jaxlocmap.se2 import POSE
 from jaxlocmap.step import Observation, Observed, clamp_map, correct, map_scan, map_spec, turn
-from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params, State
+from jaxlocmap.types import Config, Gaussian, Info, Inputs, State
 
 # rad², of a heading that is uniform on the circle.
 _UNKNOWN_HEADING = np.pi**2 / 3

@@ -25,13 +25,8 @@ def wrap_entries(x: jax.Array, angles: tuple[int, ...]) -> jax.Array:
     return jnp.stack([wrap(x[i]) if i in angles else x[i] for i in range(len(x))]) if angles else x
 
 
-def boxplus(state: jax.Array, delta: jax.Array, angles: tuple[int, ...] = HEADING) -> jax.Array:
-    """State plus a difference, (n,), the entries that are angles wrapped. Source: Hertzberg et al. 2013."""
-    return wrap_entries(state + delta, angles)
-
-
 def boxminus(a: jax.Array, b: jax.Array, angles: tuple[int, ...] = HEADING) -> jax.Array:
-    """A minus b, (n,), the entries that are angles wrapped: the inverse of `boxplus`. Source: Hertzberg et al. 2013."""
+    """A minus b, (n,), the entries that are angles wrapped. Source: Hertzberg et al. 2013."""
     return wrap_entries(a - b, angles)
 
 

@@ -97,11 +97,7 @@ def resolve(sensor: str | Sensor) -> Sensor:
     Raises:
         ValueError: an unknown name.
     """
-    if isinstance(sensor, Sensor):
-        return sensor
-    if sensor not in SENSORS:
-        raise ValueError(f"sensor: expected one of {sorted(SENSORS)} or a Sensor, got {sensor!r}")
-    return SENSORS[sensor]
+    return sensor if isinstance(sensor, Sensor) else checks.named("sensor", sensor, SENSORS, "a Sensor")
 
 
 def observe(
@@ -124,8 +120,8 @@ def observe(
     Raises:
         ValueError: a wrong shape.
     """
-    state, _ = _mounted(state, landmark, sensor, offset)
-    z = sensor.expected(state, landmark)
+    at_sensor, _ = mounted(state, landmark, sensor, offset)
+    z = sensor.expected(at_sensor, landmark)
     return jnp.stack([wrap(z[i]) if i in sensor.angles else z[i] for i in range(sensor.dim)])
 
 
@@ -151,16 +147,16 @@ def linearise(
     Raises:
         ValueError: a wrong shape.
     """
-    mounted, J = _mounted(state, landmark, sensor, offset)
+    at_sensor, J = mounted(state, landmark, sensor, offset)
     checks.shape("z", z, (sensor.dim,))
-    expected = sensor.expected(mounted, landmark)
+    expected = sensor.expected(at_sensor, landmark)
     checks.shape(f"expected {sensor.noise.name}", expected, (sensor.dim,))
-    H = Matrix.of((sensor.jacobian or jax.jacfwd(sensor.expected))(mounted, landmark))
+    H = Matrix.of((sensor.jacobian or jax.jacfwd(sensor.expected))(at_sensor, landmark))
     if H.shape not in ((sensor.dim, POSE), (sensor.dim, len(state))):
         raise ValueError(f"jacobian of {sensor.noise.name}: expected {sensor.dim} x 3 or x {len(state)}, got {H.shape}")
     by_pose = Matrix(row[:POSE] for row in H.rows) @ J
     H = Matrix(front + back[POSE:] for front, back in zip(by_pose.rows, H.rows, strict=True))
-    defined = jnp.array(True) if sensor.defined is None else sensor.defined(mounted, landmark)
+    defined = jnp.array(True) if sensor.defined is None else sensor.defined(at_sensor, landmark)
     return sensor.residual(z, expected), H, defined
 
 
@@ -201,19 +197,14 @@ def associate(
 
     def distance(landmark: jax.Array) -> jax.Array:
         residual, H, defined = linearise(mean, landmark, z, sensor=sensor, offset=offset)
-        d2 = mahalanobis(innovation_covariance(cov, H) + noise, tuple(residual[i] for i in range(m)))
+        S = quadratic_form(H, Matrix.symmetric(cov[: H.shape[1], : H.shape[1]])) + noise  # H is zero beyond
+        d2 = mahalanobis(S, tuple(residual[i] for i in range(m)))
         return jnp.where(defined, d2, jnp.inf)
 
     return jnp.argmin(jax.vmap(distance)(landmarks)).astype(jnp.int32)
 
 
-def innovation_covariance(cov: jax.Array, H: Matrix) -> Matrix:
-    """H P Hᵀ, of the columns of H alone: it is zero beyond."""
-    k = H.shape[1]
-    return quadratic_form(H, Matrix.symmetric(cov[:k, :k]))
-
-
-def _mounted(state: jax.Array, landmark: Any, sensor: Sensor, offset: Offset) -> tuple[jax.Array, Matrix]:
+def mounted(state: jax.Array, landmark: Any, sensor: Sensor, offset: Offset) -> tuple[jax.Array, Matrix]:
     """The state with the sensor's pose in the place of the robot's, and the Jacobian of the one by the other."""
     if np.ndim(state) != 1 or len(state) < POSE:
         raise ValueError(f"state: expected shape (n), n of at least {POSE}, got {np.shape(state)}")

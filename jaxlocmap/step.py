@@ -13,8 +13,9 @@ from jaxlocmap import checks, motion, sensors
 from jaxlocmap._internal.linalg import is_psd, stack_scalars
 from jaxlocmap.filters import ekf
 from jaxlocmap.mapping import grid
+from jaxlocmap.parameters import Params
 from jaxlocmap.se2 import POSE
-from jaxlocmap.types import Config, Gaussian, GridSpec, Params, State
+from jaxlocmap.types import Config, Gaussian, GridSpec, State
 
 
 class Observed(NamedTuple):

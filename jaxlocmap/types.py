@@ -10,7 +10,6 @@ import jax
 import numpy as np
 
 from jaxlocmap import checks
-from jaxlocmap.parameters import Params  # noqa: F401 (one of the records, with a module of its own)
 from jaxlocmap.se2 import POSE, Offset
 
 

@@ -546,7 +546,6 @@ SHAPES = {
 }
 # A state may have any length; what is said is what it does not fit.
 OF_A_SHORT_STATE = {
-    ("detect", "state", (1,)): r"pose: expected shape \(3\), got \(1,\)",
     ("simulate_scan", "state", (1,)): r"pose: expected shape \(3\), got \(1,\)",
     ("draw_state", "mean", (1,)): r"cov: expected shape \(1, 1\), got \(3, 3\)",
 }

@@ -277,6 +277,23 @@ def test_a_filter_may_estimate_what_its_robot_does_not_have():
     assert "state_anees" not in report
 
 
+def test_of_a_state_longer_than_the_robots_what_both_have_is_scored():
+    """The filter has a fifth entry that its robot has not: χ² of four."""
+
+    def transition(state, u, dt):
+        return jnp.append(gyro_transition(state[:4], u, dt), state[4])
+
+    wider = motion.from_transition(transition, dim=5, noise=(parameters.Q, DRIFT))
+    start = {"start": (*SCENARIO.start, 0.0), "prior_std": (*SCENARIO.prior_std, 1.0)}
+    scenario = dataclasses.replace(SCENARIO, steps=20, **start)
+    config = scenario.config(motion=wider, gate_probability=None, grid=False)
+    scene = OWN, simulation.room(), NOISE, scenario.prior()
+    report = summarise(monte_carlo(Study(scenario, config), jax.random.key(0), 400, *scene).value, config)
+    low, high = report["state_anees_band_95"]
+    assert report["state_dimension"] == 4
+    assert abs(report["state_anees"] - 4) < high - low
+
+
 def test_the_noise_of_a_block_is_said_once_or_for_each_component():
     pair = Block("gps", ("east", "north"), ("m", "m"))
     assert simulation.Noise(blocks={"gps": 0.5}).std(pair) == [0.5, 0.5]

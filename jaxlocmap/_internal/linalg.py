@@ -194,6 +194,11 @@ def block_diagonal(*blocks: Matrix) -> Matrix:
     return Matrix(rows)
 
 
+def mirrored(P: jax.Array) -> jax.Array:
+    """The symmetric (n, n) array with the upper triangle of P: what `Matrix.symmetric` is of a small one."""
+    return jnp.triu(P) + jnp.triu(P, 1).T
+
+
 def is_psd(P: jax.Array) -> jax.Array:
     """Whether a symmetric (n, n) matrix is finite and positive semi-definite, up to rounding: () bool.
 
@@ -202,9 +207,7 @@ def is_psd(P: jax.Array) -> jax.Array:
     """
     n = len(P)
     if n > SMALL:
-        lifted = (
-            jnp.triu(P) + jnp.triu(P, 1).T + jnp.diag(jnp.diagonal(P) * _rounding(P.dtype) + jnp.finfo(P.dtype).tiny)
-        )
+        lifted = mirrored(P) + jnp.diag(jnp.diagonal(P) * _rounding(P.dtype) + jnp.finfo(P.dtype).tiny)
         return jnp.all(jnp.diagonal(P) >= 0) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(lifted)))
     S = Matrix.symmetric(P)
     lift = 1 + _rounding(P.dtype)

@@ -54,6 +54,7 @@ class StateTotals(NamedTuple):
     """Of the whole state, where it is more than a pose and the truth of it is known."""
 
     scored_runs: jax.Array  # () runs with any step scored
+    entries: jax.Array  # () of the state that were scored, in these runs
     nees: jax.Array  # () the run's average, over its scored steps
     nees_square: jax.Array  # () its square
 
@@ -269,15 +270,16 @@ def run_totals(
         flagged_steps=steps.flagged,
         diverged=diverged.astype(dtype),
         map=of_map,
-        state=_state_totals(steps),
+        state=_state_totals(steps, min(len(truth), len(belief.mean))),
     )
 
 
-def _state_totals(steps: StepTally) -> StateTotals | None:
+def _state_totals(steps: StepTally, entries: int) -> StateTotals | None:
     if steps.state_scored is None or steps.state_nees is None:
         return None
     average = steps.state_nees / jnp.maximum(steps.state_scored, 1)
-    return StateTotals((steps.state_scored > 0).astype(average.dtype), average, average**2)
+    scored = (steps.state_scored > 0).astype(average.dtype)
+    return StateTotals(scored, entries * scored, average, average**2)
 
 
 def map_totals(log_odds: jax.Array | None, world: World, config: Config) -> MapTotals | None:

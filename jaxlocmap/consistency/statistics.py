@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import SMALL, Matrix, forward, ldl
+from jaxlocmap._internal.linalg import SMALL, Matrix, forward, ldl, mirrored
 from jaxlocmap.filters.ekf import gate_threshold
 from jaxlocmap.se2 import POSE, boxminus
 
@@ -58,7 +58,7 @@ def nees(error: jax.Array, cov: jax.Array) -> jax.Array:
     n = len(error)
     checks.shape("cov", cov, (n, n))
     if n > SMALL:
-        L = jnp.linalg.cholesky(jnp.triu(cov) + jnp.triu(cov, 1).T)
+        L = jnp.linalg.cholesky(mirrored(cov))
         white = jax.scipy.linalg.solve_triangular(L, error, lower=True)
         return jnp.sum(white * white)
     L, D = ldl(Matrix.symmetric(cov))

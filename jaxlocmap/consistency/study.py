@@ -32,11 +32,12 @@ from jaxlocmap.consistency.scoring import (
     score_step,
 )
 from jaxlocmap.consistency.summary import median_nees, pose_means, summarise
+from jaxlocmap.parameters import Params
 from jaxlocmap.pipeline import init
 from jaxlocmap.se2 import POSE
 from jaxlocmap.simulation.world import World
 from jaxlocmap.step import Observed, clamp_map, correct, turn
-from jaxlocmap.types import Config, Gaussian, Params, State
+from jaxlocmap.types import Config, Gaussian, State
 
 __all__ = ["MapTotals", "Study", "Totals", "median_nees", "pose_means", "reference_study", "summarise"]
 
@@ -83,7 +84,7 @@ class Study:
         model, sensor = motion.resolve(config.motion), sensors.resolve(config.sensor)
         checks.shape("prior.mean", prior.mean, (max(model.dim, scenario.dim),))
         start_key, key = jax.random.split(key)
-        truth = (prior.mean if scenario.exact_prior else simulation.draw_state(start_key, prior))[: scenario.dim]
+        truth = simulation.draw_start(start_key, prior, scenario=scenario)
         words, targets = words_of(key), simulation.targets(world, scenario=scenario)
         number = jnp.arange(len(targets), dtype=jnp.int32)
         beam_angles = scenario.beam_angles().astype(dtype)

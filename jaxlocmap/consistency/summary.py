@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxlocmap import consistency, motion, sensors
+from jaxlocmap import consistency, sensors
 from jaxlocmap.consistency.scoring import NEES_EDGES, PHASES, MapTotals, phase_edges
 from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Config
@@ -147,13 +147,14 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
         "verdict": consistency.verdict(means, basis),
     }
     if totals.state is not None:
-        report |= _state_fields(totals.state, motion.resolve(config.motion).dim)
+        report |= _state_fields(totals.state)
     if totals.map is not None:
         report["map"] = _map_fields(totals.map, runs)
     return report
 
 
-def _state_fields(totals: Any, dim: int) -> dict[str, Any]:
+def _state_fields(totals: Any) -> dict[str, Any]:
+    dim = round(float(totals.entries / np.maximum(totals.scored_runs, 1)))
     nees = _mean_over_runs(totals.nees, totals.nees_square, totals.scored_runs, dim)
     return {"state_dimension": dim, "state_anees": nees.value, "state_anees_band_95": nees.band_95}
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import scipy.special
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import SMALL, Matrix, quadratic_form, stack_scalars
+from jaxlocmap._internal.linalg import SMALL, Matrix, mirrored, quadratic_form, stack_scalars
 from jaxlocmap.filters import joseph
 from jaxlocmap.motion import MotionModel
 from jaxlocmap.se2 import HEADING, wrap
@@ -115,7 +115,7 @@ def predict(
     ratio = jnp.where(dt > 0, nominal_dt / jnp.where(dt > 0, dt, 1), 0)
     if n > SMALL:
         F, G, Q = (x.array(cov.dtype) if isinstance(x, Matrix) else jnp.asarray(x) for x in (F, G, Q))
-        return moved, _symmetric(F @ cov @ F.T + G @ Q @ G.T * ratio)
+        return moved, mirrored(F @ cov @ F.T + G @ Q @ G.T * ratio)
     F, G, Q = Matrix.of(F), Matrix.of(G), Matrix.symmetric(Q)
     P = quadratic_form(F, Matrix.symmetric(cov)) + quadratic_form(G, Q.scale(ratio))
     return moved, P.array(cov.dtype)
@@ -197,7 +197,3 @@ def update(
         accepted=accepted,
         log_likelihood=reported.log_likelihood,
     )
-
-
-def _symmetric(P: jax.Array) -> jax.Array:
-    return 0.5 * (P + P.T)

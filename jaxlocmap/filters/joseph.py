@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxlocmap._internal.linalg import Matrix, forward, ldl, quadratic_form, solve, values
+from jaxlocmap._internal.linalg import Matrix, forward, ldl, mirrored, quadratic_form, solve, values
 
 
 class Corrected(NamedTuple):
@@ -93,7 +93,7 @@ def correct(P: Matrix, H: Matrix, R: Matrix, r: tuple[Any, ...]) -> Corrected:
 def correct_array(P: jax.Array, H: Matrix, R: Matrix, r: jax.Array) -> Corrected:
     """`correct` of a state too large to unroll: P (n, n), r (m,), derivatives as JAX takes them."""
     H_array, R_array = H.array(P.dtype), R.array(P.dtype)
-    P = jnp.triu(P) + jnp.triu(P, 1).T
+    P = mirrored(P)
     cross = P @ H_array.T
     S = H_array @ cross + R_array
     L, D = ldl(Matrix.symmetric(S))
@@ -105,4 +105,4 @@ def correct_array(P: jax.Array, H: Matrix, R: Matrix, r: jax.Array) -> Corrected
     cov = A @ P @ A.T + K @ R_array @ K.T
     log_det = sum(jnp.log(d) for d in D)
     log_likelihood = -0.5 * (nis + log_det + len(r) * math.log(2 * math.pi))
-    return Corrected(tuple(K @ r), tuple(0.5 * (cov + cov.T)), Matrix.symmetric(S).rows, nis, log_likelihood)
+    return Corrected(tuple(K @ r), tuple(mirrored(cov)), Matrix.symmetric(S).rows, nis, log_likelihood)

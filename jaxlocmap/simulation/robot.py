@@ -54,6 +54,16 @@ def draw_state(key: jax.Array, prior: Gaussian) -> jax.Array:
     return state.at[2].set(wrap(state[2]))
 
 
+def draw_start(key: jax.Array, prior: Gaussian, *, scenario: Scenario) -> jax.Array:
+    """The true state (n,) at step -1, with the n entries of the plant: the mean of the prior, or drawn from it, as the
+    scenario says. Of a longer prior, which a filter may have, the first n.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    return (prior.mean if scenario.exact_prior else draw_state(key, prior))[: scenario.dim]
+
+
 def draw_drive(words: Words, k: jax.Array, *, scenario: Scenario, dtype: Any) -> jax.Array:
     """Random numbers for `drive` at step k, (3,) or (q,). words: of this drive alone, from `random.words_of`.
 
@@ -157,10 +167,10 @@ def detect(
     sensor, detector = _sensor(scenario), scenario.detector
     checks.shapes(draws=(draws, (_detection_draws(scenario),)), state=(state, (None,)), landmark=(landmark, (2,)))
     _check_noise(noise)
-    pose, _ = compose(state[:POSE], scenario.robot.sensor_offset)
-    mounted = pose if len(state) == POSE else jnp.concatenate([pose, state[POSE:]])
+    landmark_of_it = landmark if sensor.landmarks else None
+    at_sensor, _ = sensors.mounted(state, landmark_of_it, sensor, scenario.robot.sensor_offset)
     std, m = noise.std(sensor.noise), sensor.dim
-    exact = sensor.expected(mounted, landmark if sensor.landmarks else None)
+    exact = sensor.expected(at_sensor, landmark_of_it)
     z = [exact[i] + std[i] * draws[i] for i in range(m)]
     if detector.outliers:  # of what it reports, so that the rate is the share
         false = draws[m] < noise.outlier_rate
@@ -168,8 +178,8 @@ def detect(
     z = jnp.stack([wrap(x) if i in sensor.angles else x for i, x in enumerate(z)])
     if not sensor.landmarks:
         return z, jnp.array(True)
-    detected = _is_detected(pose, landmark, world, scenario)
-    return z, detected if sensor.defined is None else detected & sensor.defined(mounted, landmark)
+    detected = _is_detected(at_sensor[:POSE], landmark, world, scenario)
+    return z, detected if sensor.defined is None else detected & sensor.defined(at_sensor, landmark)
 
 
 def _false(sensor: Sensor, i: int, exact: jax.Array, uniform: jax.Array, reach: float) -> jax.Array:

@@ -14,9 +14,9 @@ import numpy as np
 from jaxlocmap import motion, sensors
 from jaxlocmap._internal.trig import arctan2
 from jaxlocmap.motion import MotionModel
-from jaxlocmap.parameters import Block, Q, R
+from jaxlocmap.parameters import Block, Params, Q, R
 from jaxlocmap.se2 import POSE, wrap
-from jaxlocmap.types import Config, Gaussian, GridSpec, Params
+from jaxlocmap.types import Config, Gaussian, GridSpec
 
 
 class Noise(NamedTuple):

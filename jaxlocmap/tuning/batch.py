@@ -203,7 +203,7 @@ def _drives(
 ) -> tuple[Any, Inputs]:
     def one(key: jax.Array, world: World) -> tuple[Any, Inputs]:
         start_key, key = jax.random.split(key)
-        start = (prior.mean if scenario.exact_prior else simulation.draw_state(start_key, prior))[: scenario.dim]
+        start = simulation.draw_start(start_key, prior, scenario=scenario)
         return simulation.simulate(key, world, noise, start, scenario=scenario, scan=scans)
 
     return jax.vmap(one, in_axes=(0, 0 if worlds else None))(keys, world)

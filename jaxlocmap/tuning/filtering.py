@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import checks, motion
+from jaxlocmap.parameters import Params
 from jaxlocmap.pipeline import init, run
 from jaxlocmap.se2 import POSE
 from jaxlocmap.tuning.batch import Batch
-from jaxlocmap.types import Config, Gaussian, Info, Inputs, Params
+from jaxlocmap.types import Config, Gaussian, Info, Inputs
 
 
 class Judged(NamedTuple):

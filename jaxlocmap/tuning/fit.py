@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from jaxlocmap.parameters import Params
 from jaxlocmap.tuning.batch import Batch, pick
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.losses import Objective
 from jaxlocmap.tuning.parameters import NOISE, Coordinates, constrain, correlations_of, natural, unconstrain
-from jaxlocmap.types import Params
 
 
 class Trace(NamedTuple):

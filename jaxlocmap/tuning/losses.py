@@ -24,14 +24,14 @@ import scipy.special
 from jaxlocmap import consistency, sensors
 from jaxlocmap._internal.linalg import Matrix, ldl
 from jaxlocmap.mapping.predictive import PredictiveScore, predict_scans
-from jaxlocmap.parameters import Block
+from jaxlocmap.parameters import Block, Params
 from jaxlocmap.se2 import POSE
 from jaxlocmap.sensors import Sensor
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.tuning.filtering import Judged, check_batch, filtered
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.parameters import SENSOR_MODEL, blocks_of, check_names
-from jaxlocmap.types import Config, Info, Params
+from jaxlocmap.types import Config, Info
 
 OUTLIER_SHARE = 0.01  # of observations, what `innovation_nll` allows for
 LEVER = 1.0  # m: a heading error of 1 rad counts in `mse` as a position error of this

@@ -8,20 +8,20 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks, motion, sensors
-from jaxlocmap import parameters as blocks_of_params
-from jaxlocmap.parameters import Block, Params
+from jaxlocmap.parameters import L_FREE, L_OCC, Block, Params, Q, R
 from jaxlocmap.types import Config
 
 Coordinates = dict[str, jax.Array]
 """Each parameter by name, () and free to take any value."""
 
-BLOCKS = (blocks_of_params.Q, blocks_of_params.R, *blocks_of_params.SENSOR_MODEL)
+_INVERSE_SENSOR_MODEL = (L_OCC, L_FREE)
+BLOCKS = (Q, R, *_INVERSE_SENSOR_MODEL)
 
 
 def blocks_of(config: Config) -> tuple[Block, ...]:
     """The blocks that a filter with these settings has: of its motion model, its sensor and its map."""
     own = (*motion.resolve(config.motion).noise, sensors.resolve(config.sensor).noise)
-    return (*own, *blocks_of_params.SENSOR_MODEL)
+    return (*own, *_INVERSE_SENSOR_MODEL)
 
 
 def names_of(blocks: tuple[Block, ...]) -> tuple[str, ...]:
@@ -44,7 +44,7 @@ def units_of(blocks: tuple[Block, ...]) -> dict[str, str]:
 NAMES = names_of(BLOCKS)
 CORRELATIONS = correlations_of(BLOCKS)
 UNITS = {name: units_of(BLOCKS)[name] for name in NAMES}
-SENSOR_MODEL = names_of(blocks_of_params.SENSOR_MODEL)
+SENSOR_MODEL = names_of(_INVERSE_SENSOR_MODEL)
 FULL_NOISE = tuple(name for name in NAMES if name not in SENSOR_MODEL)
 NOISE = tuple(name for name in FULL_NOISE if name not in CORRELATIONS)  # with Q and R diagonal
 

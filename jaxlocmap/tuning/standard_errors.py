@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.special
 
-from jaxlocmap.parameters import Block
+from jaxlocmap.parameters import Block, Params
 from jaxlocmap.tuning.batch import Batch
 from jaxlocmap.tuning.losses import Objective
 from jaxlocmap.tuning.parameters import BLOCKS, constrain, correlations_of, natural, unconstrain
-from jaxlocmap.types import Params
 
 _VAGUE = 1.0  # a standard error of a coordinate above this is said in words
 _TIED = 0.95  # a correlation above this: only a combination is known
