@@ -260,6 +260,34 @@ def test_many_runs_are_one_call_and_what_they_share_stays_shared():
     assert ((3, 4), (1, 4), (3,)) in calls
 
 
+def test_a_loop_told_what_differs_is_batched_in_one_pass():
+    def passes(zero):
+        """How often vmap goes through the body of a loop whose carry begins as a constant."""
+        seen = []
+
+        @jax.custom_batching.custom_vmap
+        def add(carry, start):
+            return carry + start
+
+        @add.def_vmap
+        def _(axis_size, in_batched, carry, start):
+            seen.append(in_batched[0])
+            return carry + start, True
+
+        def run(start):
+            def body(carry, _):
+                return add(carry, start), None
+
+            given = batching.zero_of(start) if zero else None
+            return batching.scan(body, jnp.zeros(()), jnp.arange(3), zero=given)[0]
+
+        np.testing.assert_array_equal(jax.jit(jax.vmap(run))(jnp.arange(4.0)), 3 * jnp.arange(4.0))
+        return seen
+
+    assert passes(zero=True) == [True]
+    assert passes(zero=False) == [False, True]
+
+
 # --- Flags and constants ---
 
 
@@ -275,7 +303,7 @@ def test_any_in_batch_is_one_answer_for_all():
 def test_what_differs_between_devices_adds_nothing_whatever_its_values(value):
     given = {"real": jnp.array([1.5, -2.0]), "whole": jnp.array(3), "flags": jnp.array([True, False]), "none": None}
     for tree, like in ((given, ({"a": jnp.asarray(value)}, None)), (given | {"a": jnp.asarray(value)}, jnp.ones(1))):
-        got = jax.jit(batching._vary)(tree, like)
+        got = jax.jit(lambda tree, like: batching._add_zero(tree, batching.zero_of(like)))(tree, like)
         chex.assert_trees_all_equal_shapes_and_dtypes(got, tree)
         jax.tree.map(np.testing.assert_array_equal, got, tree)
 

@@ -114,11 +114,40 @@ def _is_small(shape: tuple[int, ...]) -> bool:
     return len(shape) in (1, 2) and 0 < shape[0] <= SMALL
 
 
-def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any, *, unroll: int = 1) -> tuple[Any, Any]:
-    """`jax.lax.scan` whose carry and results are unstacked, and whose first carry may be a constant in `shard_map`."""
-    if _in_shard_map():
-        first = jax.tree.map(lambda x: x[0], xs)
-        carry = _vary(carry, (xs, body(carry, first)))
+def zero_of(*trees: Any) -> jax.Array:
+    """0, which differs between runs and devices, as far as `vmap` and `shard_map` are concerned, wherever any of the
+    arrays does. The compiler sees that it is zero, and drops it together with what it was computed from.
+
+    Returns:
+        () int32.
+    """
+    zero = jnp.zeros((), jnp.int32)
+    for leaf in jax.tree.leaves(trees):
+        if jnp.size(leaf):
+            first = jnp.ravel(leaf)[0]
+            zero = zero + jnp.where(first == first, 0, 0).astype(jnp.int32)
+    return zero
+
+
+def scan(
+    body: Callable[[Any, Any], tuple[Any, Any]],
+    carry: Any,
+    xs: Any,
+    *,
+    unroll: int = 1,
+    zero: jax.Array | None = None,
+) -> tuple[Any, Any]:
+    """`jax.lax.scan` whose carry and results are unstacked, and whose first carry may be a constant in `shard_map`.
+
+    Args:
+        body, carry, xs, unroll: as of `jax.lax.scan`.
+        zero: `zero_of` all that the loop reads. Not needed; with it the carry is batched from the start, and the body
+            need not be traced again to find what becomes so.
+    """
+    if zero is None and _in_shard_map():
+        zero = zero_of(carry, xs, body(carry, jax.tree.map(lambda x: x[0], xs)))
+    if zero is not None:
+        carry = _add_zero(carry, zero)
     scalars, stack = unstack(carry)
     outputs: list[Callable[[list[Any]], Any]] = []
 
@@ -132,16 +161,29 @@ def scan(body: Callable[[Any, Any], tuple[Any, Any]], carry: Any, xs: Any, *, un
     return stack(scalars), jax.vmap(outputs[-1])(ys) if ys else outputs[-1](ys)
 
 
-def cond(predicate: jax.Array, true: Callable[..., Any], false: Callable[..., Any], *operands: Any) -> Any:
-    """`jax.lax.cond` with operands and results unstacked, whose branches may return constants in `shard_map`."""
-    alike = (operands, true(*operands), false(*operands)) if _in_shard_map() else None
+def cond(
+    predicate: jax.Array,
+    true: Callable[..., Any],
+    false: Callable[..., Any],
+    *operands: Any,
+    zero: jax.Array | None = None,
+) -> Any:
+    """`jax.lax.cond` with operands and results unstacked, whose branches may return constants in `shard_map`.
+
+    Args:
+        predicate, true, false, *operands: as of `jax.lax.cond`.
+        zero: `zero_of` all that the branches read. Not needed; with it no branch is traced twice in `shard_map`.
+    """
+    sharded = _in_shard_map()
+    if sharded and zero is None:
+        zero = zero_of(operands, true(*operands), false(*operands))
     scalars, stack = unstack(operands)
     outputs: list[Callable[[list[Any]], Any]] = []
 
     def branch(function: Callable[..., Any]) -> Callable[[list[Any]], list[Any]]:
         def run(scalars: list[Any]) -> list[Any]:
             result = function(*stack(scalars))
-            scalars, stack_result = unstack(result if alike is None else _vary(result, alike))
+            scalars, stack_result = unstack(_add_zero(result, zero) if sharded else result)
             outputs.append(stack_result)
             return scalars
 
@@ -155,15 +197,10 @@ def _in_shard_map() -> bool:
     return bool(jax.sharding.get_abstract_mesh().manual_axes)
 
 
-def _vary(tree: Any, like: Any) -> Any:
-    """The same values, which differ between devices as far as `shard_map` is concerned wherever any of `like` may.
+def _add_zero(tree: Any, zero: jax.Array) -> Any:
+    """The same values, which now differ between runs and devices wherever `zero` does.
 
     `shard_map` wants both branches of a `cond`, and the carry before and after a step, to agree on that, and a constant
-    agrees with nothing. What is added is zero, which the compiler sees, together with what it was computed from.
+    agrees with nothing.
     """
-    zero = jnp.zeros((), jnp.int32)
-    for leaf in jax.tree.leaves((tree, like)):
-        if jnp.size(leaf):
-            first = jnp.ravel(leaf)[0]
-            zero = zero + jnp.where(first == first, 0, 0).astype(jnp.int32)
     return jax.tree.map(lambda x: jnp.logical_or(x, zero != 0) if x.dtype == bool else x + zero.astype(x.dtype), tree)

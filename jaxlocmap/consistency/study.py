@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks, motion, sensors, simulation
-from jaxlocmap._internal.batching import cond, scan, sum_over_runs
+from jaxlocmap._internal.batching import cond, scan, sum_over_runs, zero_of
 from jaxlocmap._internal.random import words_of
 from jaxlocmap.consistency.scoring import (
     PHASES,
@@ -85,6 +85,7 @@ class Study:
         checks.shape("prior.mean", prior.mean, (max(model.dim, scenario.dim),))
         start_key, key = jax.random.split(key)
         truth = simulation.draw_start(start_key, prior, scenario=scenario)
+        zero = zero_of(key, params, world, noise, prior)
         words, targets = words_of(key), simulation.targets(world, scenario=scenario)
         number = jnp.arange(len(targets), dtype=jnp.int32)
         beam_angles = scenario.beam_angles().astype(dtype)
@@ -103,7 +104,7 @@ class Study:
                 return (belief, jax.tree.map(jnp.add, tally, one_more)), latest
 
             begin = belief, no_observations(dtype, sensor.dim)
-            (belief, tally), latest = scan(one, begin, (number, targets[:, 0], targets[:, 1], latest))
+            (belief, tally), latest = scan(one, begin, (number, targets[:, 0], targets[:, 1], latest), zero=zero)
             return belief, tally, latest
 
         def rest(truth: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
@@ -116,7 +117,7 @@ class Study:
             truth, control = simulation.drive(draws, k, truth, noise, scenario=scenario)
 
             def observe(belief: Gaussian) -> Observed:
-                belief, *seen = cond(scenario.detector.active(k), detect, rest, truth, k, belief, latest)
+                belief, *seen = cond(scenario.detector.active(k), detect, rest, truth, k, belief, latest, zero=zero)
                 return Observed(belief, seen, jnp.zeros((), dtype), seen[0].unusable == 0)
 
             ranges = None
@@ -149,7 +150,7 @@ class Study:
             no_steps(dtype, whole_state=min(model.dim, scenario.dim) > POSE),
             no_observations(dtype, sensor.dim),
         )
-        (truth, state, _, steps, observations), per_step = scan(one_step, begin, jnp.arange(scenario.steps))
+        (truth, state, _, steps, observations), per_step = scan(one_step, begin, jnp.arange(scenario.steps), zero=zero)
         state = clamp_map(state, config=config)
         of_map = map_totals(state.log_odds, world, config)
         of_run = run_totals(

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks
-from jaxlocmap._internal.batching import scan
+from jaxlocmap._internal.batching import scan, zero_of
 from jaxlocmap._internal.trig import sin_cos
 from jaxlocmap.se2 import POSE
 from jaxlocmap.types import GridSpec
@@ -82,7 +82,9 @@ def ray_cast(pose: jax.Array, beam_angles: jax.Array, segments: jax.Array, max_r
         return jnp.where(hits, jnp.minimum(nearest, t), nearest), None
 
     # Beams side by side, wall after wall: a minimum over a short last axis would not be vector code.
-    return scan(nearer, jnp.full(dx.shape, max_range, dx.dtype), segments, unroll=8)[0]
+    return scan(
+        nearer, jnp.full(dx.shape, max_range, dx.dtype), segments, unroll=8, zero=zero_of(dx, segments, max_range)
+    )[0]
 
 
 def occupancy(world: World, spec: GridSpec) -> jax.Array:
