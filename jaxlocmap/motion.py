@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import Matrix
+from jaxlocmap._internal.linalg import Matrix, jacobians
 from jaxlocmap._internal.trig import sin_cos
 from jaxlocmap.parameters import Block, Q
 from jaxlocmap.se2 import HEADING, POSE, wrap
@@ -163,7 +163,10 @@ def from_transition(
         checks.shape("transition(state, u, dt)", moved, (dim,))
         return moved
 
-    return MotionModel(checked, jax.jacfwd(checked, argnums=(0, 1)), dim, tuple(angles), tuple(noise))
+    def by_state_and_input(state: jax.Array, u: jax.Array, dt: jax.Array) -> list[Any]:
+        return jacobians(lambda state, u: checked(state, u, dt), state, u)
+
+    return MotionModel(checked, by_state_and_input, dim, tuple(angles), tuple(noise))
 
 
 def resolve(model: str | MotionModel) -> MotionModel:

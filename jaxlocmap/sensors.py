@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import Matrix, mahalanobis, quadratic_form
+from jaxlocmap._internal.linalg import Matrix, jacobians, mahalanobis, quadratic_form
 from jaxlocmap._internal.trig import arctan2
 from jaxlocmap.parameters import Block, R
 from jaxlocmap.se2 import POSE, Offset, compose, wrap
@@ -151,7 +151,10 @@ def linearise(
     checks.shape("z", z, (sensor.dim,))
     expected = sensor.expected(at_sensor, landmark)
     checks.shape(f"expected {sensor.noise.name}", expected, (sensor.dim,))
-    H = Matrix.of((sensor.jacobian or jax.jacfwd(sensor.expected))(at_sensor, landmark))
+    if sensor.jacobian is not None:
+        H = Matrix.of(sensor.jacobian(at_sensor, landmark))
+    else:
+        H = Matrix.of(*jacobians(lambda state: sensor.expected(state, landmark), at_sensor))
     if H.shape not in ((sensor.dim, POSE), (sensor.dim, len(state))):
         raise ValueError(f"jacobian of {sensor.noise.name}: expected {sensor.dim} x 3 or x {len(state)}, got {H.shape}")
     by_pose = Matrix(row[:POSE] for row in H.rows) @ J

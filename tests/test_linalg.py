@@ -7,7 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxlocmap._internal.linalg import Matrix, forward, is_psd, ldl, mahalanobis, quadratic_form, solve, stack_scalars
+from jaxlocmap._internal.linalg import (
+    SMALL,
+    Matrix,
+    forward,
+    is_psd,
+    jacobians,
+    ldl,
+    mahalanobis,
+    quadratic_form,
+    solve,
+    stack_scalars,
+)
 
 
 def random_psd(rng, n, rank=None):
@@ -77,6 +88,21 @@ def parts(x, shape):
     if len(shape) == 1:
         return [x[i] for i in range(shape[0])]
     return tuple([x[i, j] for j in range(shape[1])] for i in range(shape[0]))
+
+
+@pytest.mark.parametrize("n", [3, SMALL, SMALL + 1])
+def test_jacobians_are_those_of_a_known_function(n, tolerance):
+    """Of [x' A y, |x|^2, sin(y_0) x_(n-1)] by x and by y."""
+    rng = np.random.default_rng(n)
+    A, x, y = rng.normal(size=(n, 2)), rng.normal(size=n), rng.normal(size=2)
+    arrays = jnp.asarray(x), jnp.asarray(y)
+    by_x, by_y = jacobians(lambda x, y: jnp.stack([x @ A @ y, x @ x, jnp.sin(y[0]) * x[-1]]), *arrays)
+    assert isinstance(by_x, Matrix) == isinstance(by_y, Matrix) == (n <= SMALL)
+    got = [j.array(arrays[0].dtype) if isinstance(j, Matrix) else j for j in (by_x, by_y)]
+    last = np.eye(n)[-1]
+    np.testing.assert_allclose(got[0], [A @ y, 2 * x, np.sin(y[0]) * last], rtol=0, atol=tolerance(1e-12, 1e-4))
+    slope = [x @ A, np.zeros(2), [np.cos(y[0]) * x[-1], 0]]
+    np.testing.assert_allclose(got[1], slope, rtol=0, atol=tolerance(1e-12, 1e-4))
 
 
 def test_reading_an_entry_of_a_stacked_matrix_costs_nothing():

@@ -146,9 +146,7 @@ def scan(
     """
     if zero is None and _in_shard_map():
         zero = zero_of(carry, xs, body(carry, jax.tree.map(lambda x: x[0], xs)))
-    if zero is not None:
-        carry = _add_zero(carry, zero)
-    scalars, stack = unstack(carry)
+    scalars, stack = unstack(_add_zero(carry, zero))
     outputs: list[Callable[[list[Any]], Any]] = []
 
     def turn(scalars: list[Any], x: Any) -> tuple[list[Any], list[Any]]:
@@ -174,8 +172,9 @@ def cond(
         predicate, true, false, *operands: as of `jax.lax.cond`.
         zero: `zero_of` all that the branches read. Not needed; with it no branch is traced twice in `shard_map`.
     """
-    sharded = _in_shard_map()
-    if sharded and zero is None:
+    if not _in_shard_map():
+        zero = None
+    elif zero is None:
         zero = zero_of(operands, true(*operands), false(*operands))
     scalars, stack = unstack(operands)
     outputs: list[Callable[[list[Any]], Any]] = []
@@ -183,7 +182,7 @@ def cond(
     def branch(function: Callable[..., Any]) -> Callable[[list[Any]], list[Any]]:
         def run(scalars: list[Any]) -> list[Any]:
             result = function(*stack(scalars))
-            scalars, stack_result = unstack(_add_zero(result, zero) if sharded else result)
+            scalars, stack_result = unstack(_add_zero(result, zero))
             outputs.append(stack_result)
             return scalars
 
@@ -197,10 +196,12 @@ def _in_shard_map() -> bool:
     return bool(jax.sharding.get_abstract_mesh().manual_axes)
 
 
-def _add_zero(tree: Any, zero: jax.Array) -> Any:
-    """The same values, which now differ between runs and devices wherever `zero` does.
+def _add_zero(tree: Any, zero: jax.Array | None) -> Any:
+    """The same values, which now differ between runs and devices wherever `zero` does, if there is one.
 
     `shard_map` wants both branches of a `cond`, and the carry before and after a step, to agree on that, and a constant
     agrees with nothing.
     """
+    if zero is None:
+        return tree
     return jax.tree.map(lambda x: jnp.logical_or(x, zero != 0) if x.dtype == bool else x + zero.astype(x.dtype), tree)

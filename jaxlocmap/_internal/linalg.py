@@ -231,3 +231,23 @@ def is_psd(P: jax.Array) -> jax.Array:
 
 def _rounding(dtype: Any) -> float:
     return 64 * float(jnp.finfo(dtype).eps)
+
+
+def jacobians(function: Callable[..., jax.Array], *at: jax.Array) -> list[Any]:
+    """The Jacobians (m, n) of a function of vectors by each of them, by forward-mode differentiation.
+
+    Small ones come column by column: those of `jax.jacfwd` are written to memory and read back entry by entry.
+
+    Args:
+        function: vectors -> (m,).
+        *at: the vectors, (n,) each.
+    """
+    if max(map(len, at)) > SMALL:
+        return list(jax.jacfwd(function, argnums=tuple(range(len(at))))(*at))
+    _, along = jax.linearize(function, *at)
+    none = [np.zeros(len(x), x.dtype) for x in at]
+
+    def columns(i: int) -> list[jax.Array]:
+        return [along(*none[:i], unit, *none[i + 1 :]) for unit in np.eye(len(at[i]), dtype=at[i].dtype)]
+
+    return [Matrix(columns(i)).T for i in range(len(at))]
