@@ -104,7 +104,7 @@ class Study:
                 return (belief, jax.tree.map(jnp.add, tally, one_more)), latest
 
             begin = belief, no_observations(dtype, sensor.dim)
-            (belief, tally), latest = scan(one, begin, (number, targets[:, 0], targets[:, 1], latest), zero=zero)
+            (belief, tally), latest = scan(one, begin, (number, targets[:, 0], targets[:, 1], latest))
             return belief, tally, latest
 
         def rest(truth: jax.Array, k: jax.Array, belief: Gaussian, latest: Latest) -> Any:
