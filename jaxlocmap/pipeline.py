@@ -16,9 +16,10 @@ import numpy as np
 from jaxlocmap import checks, motion, sensors
 from jaxlocmap._internal.batching import any_in_batch, cond, scan
 from jaxlocmap.mapping import grid
+from jaxlocmap.matching import submaps
 from jaxlocmap.parameters import Params
 from jaxlocmap.se2 import POSE
-from jaxlocmap.step import Observation, Observed, clamp_map, correct, map_scan, map_spec, turn
+from jaxlocmap.step import Observation, Observed, clamp_map, correct, map_scan, map_spec, state_dim, turn
 from jaxlocmap.types import Config, Gaussian, Info, Inputs, State
 
 # rad², of a heading that is uniform on the circle.
@@ -58,10 +59,12 @@ def init(prior: Gaussian, *, config: Config) -> State:
         )
     if config.grid is not None:
         checks.resolved("config.grid", grid.corners(config.grid), mean.dtype)
+    belief = Gaussian(mean, cov.astype(mean.dtype))
     return State(
-        belief=Gaussian(mean, cov.astype(mean.dtype)),
+        belief=belief if config.matcher is None else submaps.extended(belief),
         log_odds=None if config.grid is None else jnp.zeros(config.grid.shape, mean.dtype),
         log_likelihood=jnp.zeros((), mean.dtype),
+        submaps=None if config.matcher is None else submaps.empty(config.matcher, mean.dtype),
     )
 
 
@@ -200,7 +203,7 @@ def _recorded_turn(
         lambda x: jnp.asarray(x, dtype if jnp.issubdtype(jnp.result_type(x), jnp.floating) else None),
         (params, inputs, landmarks, beam_angles),
     )
-    state, slots, ok = turn(
+    turned = turn(
         params,
         state,
         inputs.control,
@@ -210,7 +213,7 @@ def _recorded_turn(
         beam_angles=beam_angles,
         config=config,
     )
-    return state, Info(belief=state.belief, **slots._asdict(), ok=ok)
+    return turned.state, Info(turned.state.belief, **turned.report._asdict(), ok=turned.ok, match=turned.match)
 
 
 def _observe_slots(
@@ -272,8 +275,9 @@ def _check_step(
     model, sensor = motion.resolve(config.motion), sensors.resolve(config.sensor)
     for block in model.noise:
         params.block(block)
-    checks.shape("state.belief.mean", state.belief.mean, (model.dim,))
-    checks.shape("state.belief.cov", state.belief.cov, (model.dim, model.dim))
+    n = state_dim(config)
+    checks.shape("state.belief.mean", state.belief.mean, (n,))
+    checks.shape("state.belief.cov", state.belief.cov, (n, n))
     checks.shape("state.log_likelihood", state.log_likelihood, ())
     if config.grid is not None and state.log_odds is None:
         raise ValueError("state.log_odds: expected a map, as init makes with this config, got None")

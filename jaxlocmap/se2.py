@@ -30,6 +30,27 @@ def boxminus(a: jax.Array, b: jax.Array, angles: tuple[int, ...] = HEADING) -> j
     return wrap_entries(a - b, angles)
 
 
+def between(a: jax.Array, b: jax.Array) -> tuple[jax.Array, Matrix, Matrix]:
+    """Pose b in the frame of pose a, a⁻¹ ∘ b.
+
+    Args:
+        a, b: (3,) m, m, rad.
+
+    Returns:
+        (3,), its heading wrapped, and its derivatives by a and by b, 3x3 each.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shapes(a=(a, (POSE,)), b=(b, (POSE,)))
+    s, c = sin_cos(a[2])
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    x, y = c * dx + s * dy, c * dy - s * dx
+    by_a = Matrix([[-c, -s, y], [s, -c, -x], [0, 0, -1]])
+    by_b = Matrix([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    return jnp.stack([x, y, wrap(b[2] - a[2])]), by_a, by_b
+
+
 def compose(pose: jax.Array, offset: Offset) -> tuple[jax.Array, Matrix]:
     """The pose of what is mounted at an offset from the robot's centre.
 

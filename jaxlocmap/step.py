@@ -10,11 +10,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks, motion, sensors
+from jaxlocmap._internal.batching import any_in_batch, cond
 from jaxlocmap._internal.linalg import is_psd, stack_scalars
 from jaxlocmap.filters import ekf
 from jaxlocmap.mapping import grid
+from jaxlocmap.matching import submaps as matching
 from jaxlocmap.parameters import Params
-from jaxlocmap.se2 import POSE
+from jaxlocmap.se2 import HEADING, POSE
 from jaxlocmap.types import Config, Gaussian, GridSpec, State
 
 
@@ -38,6 +40,15 @@ class Observation(NamedTuple):
     row: jax.Array
 
 
+class Turned(NamedTuple):
+    """What `turn` makes of a step."""
+
+    state: State
+    report: Any  # of the observations
+    match: matching.MatchReport | None  # None without a matcher or a scanner
+    ok: jax.Array  # () bool: control, step length and observations could be used, and the belief is valid
+
+
 def turn(
     params: Params,
     state: State,
@@ -48,11 +59,9 @@ def turn(
     ranges: jax.Array | None,
     beam_angles: jax.Array | None,
     config: Config,
-) -> tuple[State, Any, jax.Array]:
-    """Predict the belief, correct it by what is observed, add the scan to the map at the corrected pose.
-
-    A second source of corrections, such as a scan matched against the map, goes where `observe` is: it takes the
-    belief, and the map before this scan as `clamp_map` reads it, and returns an `Observed` too.
+) -> Turned:
+    """Predict the belief, correct it by what is observed and by the scan, add the scan to the map at the corrected
+    pose.
 
     Args:
         params: what is tuned.
@@ -65,20 +74,65 @@ def turn(
         beam_angles: (B,) rad; None without a scanner.
         config: static.
 
-    Returns:
-        The state after this step, what `observe` reports, and () bool whether control, step length and observations
-        could be used and the belief is valid.
-
     Raises:
         ValueError: a wrong shape, or a block that `params` lacks.
     """
-    belief, moved = predict(params, state.belief, control, dt, config=config)
-    observed = observe(belief)
-    belief, log_odds = observed.belief, state.log_odds
-    if log_odds is not None and ranges is not None and beam_angles is not None:
-        log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
+    predicted, moved = predict(params, state.belief, control, dt, config=config)
+    observed = observe(predicted)
+    belief, log_odds, submaps, report = observed.belief, state.log_odds, state.submaps, None
+    if ranges is not None and beam_angles is not None:
+        if submaps is not None and config.matcher is not None:
+            submaps = matching.travelled(submaps, state.belief.mean, predicted.mean)
+            belief, submaps, report = match(params, belief, submaps, ranges, beam_angles, config=config)
+        if log_odds is not None:
+            log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
     ok = moved & observed.ok & is_valid(belief)
-    return State(belief, log_odds, state.log_likelihood + observed.log_likelihood), observed.report, ok
+    state = State(belief, log_odds, state.log_likelihood + observed.log_likelihood, submaps)
+    return Turned(state, observed.report, report, ok)
+
+
+def match(
+    params: Params,
+    belief: Gaussian,
+    submaps: matching.Submaps,
+    ranges: jax.Array,
+    beam_angles: jax.Array,
+    *,
+    config: Config,
+) -> tuple[Gaussian, matching.Submaps, matching.MatchReport]:
+    """The belief corrected by the scan, if one is due to be matched."""
+    matcher = config.matcher
+    if matcher is None:
+        raise ValueError("config.matcher: expected the Matcher that the submaps were made for, got None")
+
+    def now(belief: Gaussian, submaps: matching.Submaps) -> Any:
+        return matching.match_scan(
+            params,
+            belief,
+            submaps,
+            ranges,
+            scanner=config.scanner(beam_angles),
+            matcher=matcher,
+            angles=state_angles(config),
+        )
+
+    def not_now(belief: Gaussian, submaps: matching.Submaps) -> Any:
+        return belief, submaps, matching.no_match(belief.mean.dtype)
+
+    due = any_in_batch(submaps.steps % matcher.period == 0)  # all runs of a batch are at the same step
+    belief, submaps, report = cond(due, now, not_now, belief, submaps)
+    return belief, submaps._replace(steps=submaps.steps + 1), report
+
+
+def state_dim(config: Config) -> int:
+    """Entries of the filter's state: those of the motion model, and of the submaps if scans are matched."""
+    return motion.resolve(config.motion).dim + (matching.EXTRA if config.matcher is not None else 0)
+
+
+def state_angles(config: Config) -> tuple[int, ...]:
+    """Those of them that are angles."""
+    model, whole = motion.resolve(config.motion), state_dim(config)
+    return (*model.angles, *range(model.dim + HEADING[0], whole, POSE))
 
 
 def clamp_map(state: State, *, config: Config) -> State:
@@ -143,8 +197,8 @@ def correct(
     Raises:
         ValueError: a wrong shape, or a block of noise that `params` lacks.
     """
-    sensor, model = sensors.resolve(config.sensor), motion.resolve(config.motion)
-    m, n = sensor.dim, model.dim
+    sensor = sensors.resolve(config.sensor)
+    m, n = sensor.dim, state_dim(config)
     checks.shapes(mean=(belief.mean, (n,)), cov=(belief.cov, (n, n)))
     checks.shapes(z=(z, (m,)), row=(row, ()), usable=(usable, ()))
     landmark = landmark if sensor.landmarks else None
@@ -163,7 +217,7 @@ def correct(
         threshold=_gate_threshold(params, config, m, z.dtype),
         temperature=config.gate_temperature,
         valid=used,
-        angles=model.angles,
+        angles=state_angles(config),
     )
 
     def known(x: jax.Array) -> jax.Array:

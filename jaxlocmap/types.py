@@ -81,6 +81,7 @@ class Config:
     max_range: float = 8.0  # m: a range at or above clears cells up to here and marks none
     scanner_offset: Offset = (0.0, 0.0, 0.0)  # m, m, rad: where the scanner sits in the body frame
     sensor: Any = "range_bearing"  # or a sensors.Sensor: what the observation slots hold
+    matcher: Matcher | None = None  # None: scans make the map and correct no pose
 
     def __post_init__(self) -> None:
         freeze_tuples(self, "sensor_offset", "scanner_offset")
@@ -110,6 +111,49 @@ class Config:
     def scanner(self, beam_angles: jax.Array) -> Scanner:
         """The scanner with these beams, (B,) rad in its own frame."""
         return Scanner(beam_angles, self.scanner_offset, self.min_range, self.max_range)
+
+
+@dataclasses.dataclass(frozen=True)
+class Matcher:
+    """How scans are matched on submaps of what was seen before. Frozen and hashable, so static under jit.
+
+    Raises:
+        ValueError: a field outside the range given beside it.
+        TypeError: a field that is no number.
+    """
+
+    period: int = 1  # steps between two matches, the first at step 0; >= 1
+    submap_scans: int = 10  # a new submap begins that often, and lives twice as long; >= 2
+    resolution: float = 0.1  # m per cell, > 0
+    half_width: float = 12.0  # m of a submap about its anchor: the reach of a scan and some travel; > resolution
+    gap: float = 0.5  # m, > 0: ends of neighbouring beams farther apart than this lie on two surfaces
+    steps: int = 10  # of Gauss-Newton; >= 1
+    gate_probability: float = 0.999  # in (0, 1): share of good matches let in
+    least_points: int = 10  # with a normal, that a scan must have; >= 1
+    least_share: float = 0.4  # in (0, 1), of a scan's points that must lie on lines of the submap
+    patience: int = 5  # matches refused in a row before the submaps are begun anew; >= 1
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            checks.number(field.name, getattr(self, field.name))
+        for name, least in (("period", 1), ("submap_scans", 2), ("steps", 1), ("least_points", 1), ("patience", 1)):
+            value = getattr(self, name)
+            if int(value) != value or value < least:
+                raise ValueError(f"Matcher.{name}: expected a whole number of at least {least}, got {value}")
+        for name in ("gate_probability", "least_share"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"Matcher.{name}: expected a value inside (0, 1), got {getattr(self, name)}")
+        for name in ("resolution", "gap", "half_width"):
+            least = self.resolution if name == "half_width" else 0
+            if not least < getattr(self, name) < math.inf:
+                raise ValueError(f"Matcher.{name}: expected finite metres > {least}, got {getattr(self, name)}")
+
+    @property
+    def spec(self) -> GridSpec:
+        """The grid of a submap, in the frame of its anchor."""
+        cells = 2 * math.ceil(self.half_width / self.resolution)
+        corner = -cells / 2 * self.resolution
+        return GridSpec(origin=(corner, corner), resolution=self.resolution, shape=(cells, cells))
 
 
 @jax.tree_util.register_dataclass
@@ -154,6 +198,7 @@ class State(NamedTuple):
     belief: Gaussian
     log_odds: jax.Array | None  # (rows, columns) nats; None without a grid
     log_likelihood: jax.Array  # () nats: sum over every observation so far, let in or not
+    submaps: Any = None  # matching.submaps.Submaps; None without a matcher
 
 
 class Info(NamedTuple):
@@ -167,6 +212,7 @@ class Info(NamedTuple):
     log_likelihood: jax.Array  # (M,) nats: log density of the innovation, gated or not
     row: jax.Array  # (M,) int32: row of `landmarks` the observation was taken for, -1 in an empty slot
     ok: jax.Array  # () bool: inputs finite, covariance positive semi-definite
+    match: Any = None  # matching.submaps.MatchReport; None without a matcher or a scanner
 
 
 class Truth(NamedTuple):

@@ -251,3 +251,17 @@ def jacobians(function: Callable[..., jax.Array], *at: jax.Array) -> list[Any]:
         return [along(*none[:i], unit, *none[i + 1 :]) for unit in np.eye(len(at[i]), dtype=at[i].dtype)]
 
     return [Matrix(columns(i)).T for i in range(len(at))]
+
+
+def inverse(M: Matrix) -> Matrix:
+    """Of a 3x3 matrix, by cofactors."""
+    if M.shape != (3, 3):
+        raise ValueError(f"expected a 3x3 matrix, got {M.shape}")
+
+    def cofactor(i: int, j: int) -> Scalar:
+        (a, b), (c, d) = ([M[(i + k) % 3, (j + n) % 3] for n in (1, 2)] for k in (1, 2))
+        return a * d - b * c
+
+    adjugate = [[cofactor(j, i) for j in range(3)] for i in range(3)]
+    determinant = sum(M[0, j] * adjugate[j][0] for j in range(3))
+    return Matrix(adjugate).scale(1 / determinant)

@@ -124,7 +124,7 @@ class Study:
             if config.grid is not None:
                 draws = simulation.draw_scan(words, k, scenario=scenario, dtype=dtype)
                 ranges = simulation.simulate_scan(draws, truth, world, noise, scenario=scenario)
-            state, (seen, latest), ok = turn(
+            state, (seen, latest), _, ok = turn(
                 params,
                 state,
                 control,
@@ -135,7 +135,9 @@ class Study:
                 config=config,
             )
             phase = PHASES * k // scenario.steps
-            stepped, error_square, variance = score_step(state.belief, truth, ok, phase, angles=model.angles)
+            stepped, error_square, variance = score_step(
+                state.belief.first(model.dim), truth, ok, phase, angles=model.angles
+            )
             at_step = PerStep(
                 stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted
             )
@@ -157,7 +159,7 @@ class Study:
             steps,
             observations,
             truth,
-            state.belief,
+            state.belief.first(model.dim),
             of_map,
             length=scenario.steps,
             exact_start=scenario.exact_prior,

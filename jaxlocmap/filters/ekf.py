@@ -93,7 +93,7 @@ def predict(
     whole. At dt = 0, where G is zero, nothing is added.
 
     Args:
-        mean: (n,) state, beginning with the pose in m, m, rad.
+        mean: (n,) state, beginning with the pose in m, m, rad. Entries beyond those of the motion model stand still.
         cov: (n, n).
         control: (c,), v m/s and omega rad/s for a differential drive; as long as u (q,) or shorter.
         dt: () s, >= 0.
@@ -108,6 +108,12 @@ def predict(
         ValueError: a wrong shape, also of what the motion model returns.
     """
     n, q = motion.dim, motion.inputs
+    if len(mean) > n:
+        checks.shape("cov", cov, (len(mean), len(mean)))
+        moved, front = predict(mean[:n], cov[:n, :n], control, dt, Q, motion=motion, nominal_dt=nominal_dt)
+        F, _ = motion.jacobians(mean[:n], motion.full_input(control), dt)
+        cross = (F.array(cov.dtype) if isinstance(F, Matrix) else F) @ cov[:n, n:]
+        return jnp.concatenate([moved, mean[n:]]), jnp.block([[front, cross], [cross.T, cov[n:, n:]]])
     checks.shapes(mean=(mean, (n,)), cov=(cov, (n, n)), dt=(dt, ()), Q=(Q, (q, q)))
     u = motion.full_input(control)
     moved, (F, G) = motion.transition(mean, u, dt), motion.jacobians(mean, u, dt)

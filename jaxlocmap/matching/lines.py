@@ -1,0 +1,157 @@
+"""The map that scans are matched on: a grid in which every cell keeps sums over the surface points near it.
+
+    A = Σ w n nᵀ,  b = Σ w n nᵀ (p - c),  W = Σ w
+
+p is a point, n its normal, c the centre of the cell and w a weight that falls linearly to zero two cells from p in
+either direction. A is what the cell knows of the direction of the walls in it, and A⁻¹ b where they stand, as far as A
+has an inverse: along a wall nothing is known and nothing is claimed. A sum over points needs no order, the sign of a
+normal does not matter, and a thin wall may be seen from both sides.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxlocmap import checks
+from jaxlocmap._internal.linalg import stack_scalars
+from jaxlocmap._internal.trig import sin_cos
+from jaxlocmap.matching.normals import Points
+from jaxlocmap.se2 import POSE
+from jaxlocmap.types import GridSpec
+
+SUMS = 6  # of a cell: A (xx, xy, yy), b (x, y), W
+REACH = 0.3  # m: a point farther off a line than this does not belong to it
+_LEAST_WEIGHT = 0.05  # W of a cell that knows anything: half a point at its corner
+_LEAST_AGREEMENT = 0.5  # share of the weight whose normals agree with that of a point
+
+
+class Fit(NamedTuple):
+    """How the points of a scan lie on the lines of a map, at one pose."""
+
+    hessian: jax.Array  # (3, 3) 1, 1, m^2 on the diagonal: sum of w J' J, J the derivative of a residual by the pose
+    slope: jax.Array  # (3,) m, m, m^2: sum of w J' r
+    residual: jax.Array  # (B,) m, distance of each point from its line; 0 where not used
+    used: jax.Array  # (B,) bool: the point has a line
+    weight: jax.Array  # (B,) share of each point that counts; 0 where not used
+
+
+def add_points(
+    lines: jax.Array,
+    pose: jax.Array,
+    points: Points,
+    *,
+    spec: GridSpec,
+    counts: jax.Array | bool = True,
+    at: int | jax.Array = 0,
+) -> jax.Array:
+    """The map with the points of one more scan.
+
+    Args:
+        lines: (maps * rows, columns, 6), zeros for one that knows nothing: one map, or several in one array.
+        pose: (3,) m, m, rad, of the robot in the map's frame.
+        points: of the scan, in the robot's frame; those outside the map are left out.
+        spec: of one map; its bounds on log-odds do not matter.
+        counts: () bool; False adds nothing.
+        at: () which of the maps.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    rows, columns = _check(lines, pose, points, spec)
+    x, y, normal_x, normal_y, _, _ = _placed(pose, points)
+    u, v = _in_cells(x, y, spec)
+    column, row = (jnp.floor(w).astype(jnp.int32) for w in (u, v))
+    index, sums = [], []
+    for i in (-1, 0, 1, 2):
+        for j in (-1, 0, 1, 2):
+            du, dv = u - (column + j), v - (row + i)
+            inside = (row + i >= 0) & (row + i < rows) & (column + j >= 0) & (column + j < columns)
+            w = jnp.where(points.valid & inside & counts, (1 - jnp.abs(du) / 2) * (1 - jnp.abs(dv) / 2), 0)
+            off = (normal_x * du + normal_y * dv) * spec.resolution
+            n = (normal_x * normal_x, normal_x * normal_y, normal_y * normal_y, normal_x * off, normal_y * off)
+            sums.append(jnp.stack([*(w * term for term in n), w], axis=-1))
+            index.append((jnp.clip(row + i, 0, rows - 1) + at * rows) * columns + jnp.clip(column + j, 0, columns - 1))
+    flat = lines.reshape(-1, SUMS)
+    flat = flat.at[jnp.concatenate(index)].add(jnp.concatenate(sums), mode="promise_in_bounds")
+    return flat.reshape(lines.shape)
+
+
+def fit(
+    lines: jax.Array, pose: jax.Array, points: Points, scale: jax.Array, *, spec: GridSpec, at: int | jax.Array = 0
+) -> Fit:
+    """How far the points of a scan lie off the lines of the map, and how that changes with the pose.
+
+        r = mᵀ (A q - b) / (mᵀ A m),  J = [mᵀ, mᵀ (R p)^⊥],  w = (mᵀ A m / W) / (1 + (r / scale)²)
+
+    q is the point in the map's frame, m its normal there, and the sums are read between the centres of four cells, each
+    about its own centre. A point is left out where W is small, where the normals of the map do not agree with its own,
+    or where it lies `REACH` or farther off its line.
+
+    Args:
+        lines, pose, points, spec, at: as of `add_points`.
+        scale: () m, of the Cauchy weight: a point that far off its line counts half.
+
+    Source: Biber & Strasser 2003 (a grid of local surfaces); Censi 2008 (point to line); the weight Cauchy's.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    rows, columns = _check(lines, pose, points, spec)
+    checks.shape("scale", scale, ())
+    x, y, normal_x, normal_y, arm_x, arm_y = _placed(pose, points)
+    u, v = _in_cells(x, y, spec)
+    column, row = (jnp.floor(w).astype(jnp.int32) for w in (u, v))
+    inside = (row >= 0) & (row < rows - 1) & (column >= 0) & (column < columns - 1)
+    column, row = jnp.clip(column, 0, columns - 2), jnp.clip(row, 0, rows - 2)
+    u, v = u - column, v - row
+    flat = lines.reshape(-1, SUMS)
+    xx = xy = yy = off_x = off_y = weight = jnp.zeros_like(x)
+    for i in (0, 1):
+        for j in (0, 1):
+            cell = flat.at[(row + i + at * rows) * columns + column + j].get(mode="promise_in_bounds")
+            w = (u if j else 1 - u) * (v if i else 1 - v)
+            dx, dy = (u - j) * spec.resolution, (v - i) * spec.resolution
+            a, b, c = cell[:, 0], cell[:, 1], cell[:, 2]
+            xx, xy, yy, weight = xx + w * a, xy + w * b, yy + w * c, weight + w * cell[:, 5]
+            off_x = off_x + w * (a * dx + b * dy - cell[:, 3])
+            off_y = off_y + w * (b * dx + c * dy - cell[:, 4])
+    agree = normal_x * normal_x * xx + 2 * normal_x * normal_y * xy + normal_y * normal_y * yy
+    known = points.valid & inside & (weight > _LEAST_WEIGHT) & (agree > _LEAST_AGREEMENT * weight)
+    residual = (normal_x * off_x + normal_y * off_y) / jnp.where(known, agree, 1)
+    used = known & (jnp.abs(residual) < REACH)
+    residual = jnp.where(used, residual, 0)
+    share = jnp.where(used, agree / jnp.where(used, weight, 1) / (1 + (residual / scale) ** 2), 0)
+    J = normal_x, normal_y, normal_y * arm_x - normal_x * arm_y
+    hessian = [[jnp.sum(share * J[min(i, j)] * J[max(i, j)]) for j in range(POSE)] for i in range(POSE)]
+    slope = jnp.stack([jnp.sum(share * Ji * residual) for Ji in J])
+    return Fit(stack_scalars(hessian), slope, residual, used, share)
+
+
+def _placed(pose: jax.Array, points: Points) -> tuple[jax.Array, ...]:
+    """Points and normals in the map's frame, and from the robot to each point, still in that frame: (B,) each."""
+    sin, cos = sin_cos(pose[2])
+
+    def turned(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x, y = vectors[:, 0], vectors[:, 1]
+        return cos * x - sin * y, sin * x + cos * y
+
+    arm_x, arm_y = turned(points.xy)
+    return pose[0] + arm_x, pose[1] + arm_y, *turned(points.normal), arm_x, arm_y
+
+
+def _in_cells(x: jax.Array, y: jax.Array, spec: GridSpec) -> tuple[jax.Array, jax.Array]:
+    """Where points lie, in cells from the centre of the first."""
+    per_metre = 1 / spec.resolution
+    return (x - spec.origin[0]) * per_metre - 0.5, (y - spec.origin[1]) * per_metre - 0.5
+
+
+def _check(lines: jax.Array, pose: jax.Array, points: Points, spec: GridSpec) -> tuple[int, int]:
+    rows, columns = spec.shape
+    checks.shapes(lines=(lines, (None, columns, SUMS)), pose=(pose, (POSE,)))
+    if len(lines) % rows:
+        raise ValueError(f"lines: expected maps of {rows} rows, got {len(lines)} rows")
+    checks.shapes(xy=(points.xy, (None, 2)), normal=(points.normal, (len(points.xy), 2)))
+    return rows, columns
