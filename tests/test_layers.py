@@ -11,6 +11,7 @@ LAYERS = (
     ("se2",),
     ("parameters", "types", "motion", "sensors"),
     ("filters", "mapping"),
+    ("matching",),
     ("step",),
     ("pipeline",),
     ("simulation",),

@@ -62,12 +62,11 @@ def add_points(
     """
     rows, columns = _check(lines, pose, points, spec)
     x, y, normal_x, normal_y, _, _ = _placed(pose, points)
-    u, v = _in_cells(x, y, spec)
-    column, row = (jnp.floor(w).astype(jnp.int32) for w in (u, v))
+    (column, u), (row, v) = _in_cells(x, y, spec)
     index, sums = [], []
     for i in (-1, 0, 1, 2):
         for j in (-1, 0, 1, 2):
-            du, dv = u - (column + j), v - (row + i)
+            du, dv = u - j, v - i
             inside = (row + i >= 0) & (row + i < rows) & (column + j >= 0) & (column + j < columns)
             w = jnp.where(points.valid & inside & counts, (1 - jnp.abs(du) / 2) * (1 - jnp.abs(dv) / 2), 0)
             off = (normal_x * du + normal_y * dv) * spec.resolution
@@ -102,11 +101,9 @@ def fit(
     rows, columns = _check(lines, pose, points, spec)
     checks.shape("scale", scale, ())
     x, y, normal_x, normal_y, arm_x, arm_y = _placed(pose, points)
-    u, v = _in_cells(x, y, spec)
-    column, row = (jnp.floor(w).astype(jnp.int32) for w in (u, v))
+    (column, u), (row, v) = _in_cells(x, y, spec)
     inside = (row >= 0) & (row < rows - 1) & (column >= 0) & (column < columns - 1)
     column, row = jnp.clip(column, 0, columns - 2), jnp.clip(row, 0, rows - 2)
-    u, v = u - column, v - row
     flat = lines.reshape(-1, SUMS)
     xx = xy = yy = off_x = off_y = weight = jnp.zeros_like(x)
     for i in (0, 1):
@@ -142,10 +139,14 @@ def _placed(pose: jax.Array, points: Points) -> tuple[jax.Array, ...]:
     return pose[0] + arm_x, pose[1] + arm_y, *turned(points.normal), arm_x, arm_y
 
 
-def _in_cells(x: jax.Array, y: jax.Array, spec: GridSpec) -> tuple[jax.Array, jax.Array]:
-    """Where points lie, in cells from the centre of the first."""
-    per_metre = 1 / spec.resolution
-    return (x - spec.origin[0]) * per_metre - 0.5, (y - spec.origin[1]) * per_metre - 0.5
+def _in_cells(x: jax.Array, y: jax.Array, spec: GridSpec) -> list[tuple[jax.Array, jax.Array]]:
+    """The column and the row whose centre is next below each point, and how far beyond it the point is, in cells."""
+    cells = []
+    for value, origin in ((x, spec.origin[0]), (y, spec.origin[1])):
+        position = (value - origin) * (1 / spec.resolution) - 0.5
+        whole = jnp.floor(position)
+        cells.append((whole.astype(jnp.int32), position - whole))
+    return cells
 
 
 def _check(lines: jax.Array, pose: jax.Array, points: Points, spec: GridSpec) -> tuple[int, int]:

@@ -162,11 +162,13 @@ def match_scan(
     nis = moved @ found.score
     tried = usable & (submaps.scans[0] > 0)
     gate = ekf.gate_threshold(matcher.gate_probability, POSE)
-    accepted = tried & (nis < gate) & (found.used >= matcher.least_share * found.points)
+    accepted = (
+        tried & (nis < gate) & (found.used.astype(nis.dtype) >= matcher.least_share * found.points.astype(nis.dtype))
+    )
     gradient = found.information @ moved + found.score
     corrected = information.update(*belief, H, found.information, gradient, angles=angles)
     belief = _chosen(accepted, Gaussian(*corrected), belief)
-    refused = jnp.where(accepted, 0, submaps.refused + tried)
+    refused = jnp.where(accepted, 0, submaps.refused + tried.astype(jnp.int32))
 
     # Begin submaps: the first, the next, or anew after too many refusals.
     active = submaps.scans[1] > 0
@@ -198,7 +200,7 @@ def match_scan(
         own = line_grid.fit(lines, pose, points, scale, spec=matcher.spec, at=slot).hessian / std**2
         told = jnp.where((place == 0) & ~fresh, 0, own)  # the older one was matched on: the belief knows already
         belief = _chosen(added[place], _moved_bias(belief, entry, kappa, H, rel, told), belief)
-    scans = scans + added
+    scans = scans + added.astype(jnp.int32)
     submaps = Submaps(
         lines=lines,
         older=which,
@@ -206,7 +208,7 @@ def match_scan(
         travel=jnp.where(jnp.any(added), 0, submaps.travel),
         steps=submaps.steps,
         refused=jnp.where(anew, 0, refused),
-        begun=submaps.begun + due + anew,
+        begun=submaps.begun + (due | anew).astype(jnp.int32),
     )
     report = MatchReport(
         tried=tried,
