@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap.consistency import statistics
+from jaxlocmap.consistency.match_scoring import MatchTotals
 from jaxlocmap.mapping import quality
 from jaxlocmap.se2 import POSE, boxminus
 from jaxlocmap.simulation.world import World, occupancy
@@ -89,6 +90,7 @@ class Totals(NamedTuple):
     diverged: jax.Array  # () 1 if the run diverged at any step, or ended without a finite belief
     map: MapTotals | None
     state: StateTotals | None = None
+    match: MatchTotals | None = None
 
 
 class StepTally(NamedTuple):
@@ -223,6 +225,7 @@ def run_totals(
     truth: jax.Array,
     belief: Gaussian,
     of_map: MapTotals | None,
+    of_matches: MatchTotals | None = None,
     *,
     length: int,
     exact_start: bool,
@@ -270,6 +273,7 @@ def run_totals(
         flagged_steps=steps.flagged,
         diverged=diverged.astype(dtype),
         map=of_map,
+        match=of_matches,
         state=_state_totals(steps, min(len(truth), len(belief.mean))),
     )
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxlocmap import checks, motion, sensors, simulation
 from jaxlocmap._internal.batching import cond, scan, sum_over_runs, zero_of
 from jaxlocmap._internal.random import words_of
+from jaxlocmap.consistency.match_scoring import match_totals, no_matches, score_match
 from jaxlocmap.consistency.scoring import (
     PHASES,
     Latest,
@@ -112,7 +113,7 @@ class Study:
             return belief, no_observations(dtype, sensor.dim), latest
 
         def one_step(carry: tuple[Any, ...], k: jax.Array) -> tuple[tuple[Any, ...], PerStep]:
-            truth, state, latest, steps, observations = carry
+            truth, state, latest, steps, observations, matches, anchors = carry
             draws = simulation.draw_drive(words, k, scenario=scenario, dtype=dtype)
             truth, control = simulation.drive(draws, k, truth, noise, scenario=scenario)
 
@@ -121,10 +122,10 @@ class Study:
                 return Observed(belief, seen, jnp.zeros((), dtype), seen[0].unusable == 0)
 
             ranges = None
-            if config.grid is not None:
+            if config.grid is not None or config.matcher is not None:
                 draws = simulation.draw_scan(words, k, scenario=scenario, dtype=dtype)
                 ranges = simulation.simulate_scan(draws, truth, world, noise, scenario=scenario)
-            state, (seen, latest), _, ok = turn(
+            state, (seen, latest), match, ok = turn(
                 params,
                 state,
                 control,
@@ -142,7 +143,10 @@ class Study:
                 stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted
             )
             steps, observations = jax.tree.map(jnp.add, (steps, observations), (stepped, seen))
-            return (truth, state, latest, steps, observations), add_up(at_step)
+            if match is not None:
+                matched, anchors = score_match(match, truth[:POSE], anchors)
+                matches = jax.tree.map(jnp.add, matches, matched)
+            return (truth, state, latest, steps, observations, matches, anchors), add_up(at_step)
 
         none = jnp.zeros(len(targets), dtype)
         begin = (
@@ -151,8 +155,11 @@ class Study:
             Latest(none != 0, (none,) * sensor.dim),
             no_steps(dtype, whole_state=min(model.dim, scenario.dim) > POSE),
             no_observations(dtype, sensor.dim),
+            None if config.matcher is None else no_matches(dtype),
+            None if config.matcher is None else (truth[:POSE], truth[:POSE]),
         )
-        (truth, state, _, steps, observations), per_step = scan(one_step, begin, jnp.arange(scenario.steps), zero=zero)
+        ended, per_step = scan(one_step, begin, jnp.arange(scenario.steps), zero=zero)
+        truth, state, _, steps, observations, matches, _ = ended
         state = clamp_map(state, config=config)
         of_map = map_totals(state.log_odds, world, config)
         of_run = run_totals(
@@ -161,6 +168,7 @@ class Study:
             truth,
             state.belief.first(model.dim),
             of_map,
+            None if matches is None else match_totals(matches),
             length=scenario.steps,
             exact_start=scenario.exact_prior,
         )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxlocmap import consistency, sensors
+from jaxlocmap.consistency.match_scoring import match_fields
 from jaxlocmap.consistency.scoring import NEES_EDGES, PHASES, MapTotals, phase_edges
 from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Config
@@ -148,6 +149,8 @@ def summarise(totals: Any, config: Config, reference: Any = None) -> dict[str, A
     }
     if totals.state is not None:
         report |= _state_fields(totals.state)
+    if totals.match is not None:
+        report |= match_fields(totals.match)
     if totals.map is not None:
         report["map"] = _map_fields(totals.map, runs)
     return report

@@ -59,8 +59,11 @@ class MatchReport(NamedTuple):
     used: jax.Array  # () int32: those that lie on lines of the submap
     accepted: jax.Array  # () bool
     submap: jax.Array  # () int32: number of the submap matched on, from 0
-    edge: Gaussian  # (3,), (3, 3) m, m, rad: of a submap that is finished, where the next one's anchor is from its own
-    finished: jax.Array  # () bool: there is an edge
+    relative: Gaussian  # (3,), (3, 3) m, m, rad: the pose corrected, in the frame of that submap's anchor
+    begun: jax.Array  # () bool: a younger submap begins, at this pose
+    anew: jax.Array  # () bool: an older one does: the first of all, or after too many refusals
+    finished: jax.Array  # () bool: the older one is finished, and the younger takes its place
+    edge: Gaussian  # (3,), (3, 3) m, m, rad: then the younger one's anchor in the frame of the older one's
 
 
 def with_defaults(params: Params, *, std: float = 0.03, scale: float = 0.1, length: float = 0.6) -> Params:
@@ -88,7 +91,8 @@ def no_match(dtype: np.dtype) -> MatchReport:
     """The report of a step without a match."""
     none, real = jnp.zeros((), jnp.int32), jnp.zeros((), dtype)
     vector, square, false = jnp.zeros(POSE, dtype), jnp.zeros((POSE, POSE), dtype), jnp.zeros((), bool)
-    return MatchReport(false, vector, square, real, none, none, false, none, Gaussian(vector, square), false)
+    pose = Gaussian(vector, square)
+    return MatchReport(false, vector, square, real, none, none, false, none, pose, false, false, false, pose)
 
 
 def extended(belief: Gaussian) -> Gaussian:
@@ -153,6 +157,7 @@ def match_scan(
     usable = jnp.sum(points.valid, dtype=jnp.int32) >= matcher.least_points
 
     # Match on the older submap.
+    number = submaps.begun - 1 - (submaps.scans[1] > 0).astype(jnp.int32)
     predicted, H = relative_pose(belief.mean, older)
     rel = H @ belief.cov @ H.T
     found = match(
@@ -170,13 +175,15 @@ def match_scan(
     belief = _chosen(accepted, Gaussian(*corrected), belief)
     refused = jnp.where(accepted, 0, submaps.refused + tried.astype(jnp.int32))
 
+    relative = _between(belief, older, 0)
+
     # Begin submaps: the first, the next, or anew after too many refusals.
     active = submaps.scans[1] > 0
     full = submaps.scans[jnp.where(active, 1, 0)] >= matcher.submap_scans
     anew = usable & ((submaps.scans[0] == 0) | (refused >= matcher.patience))
     due = accepted & full
     finished = due & active
-    edge = _between_anchors(belief, older, younger)
+    edge = _between(belief, older, younger)
     belief = _chosen(finished, _younger_as_older(belief, older), belief)
     belief = _chosen(due, _begun(belief, younger), belief)
     belief = _chosen(anew, _begun(belief, older), belief)
@@ -218,9 +225,12 @@ def match_scan(
         points=found.points,
         used=jnp.where(tried, found.used, 0),
         accepted=accepted,
-        submap=submaps.begun,
-        edge=Gaussian(*(jnp.where(finished, x, 0) for x in edge)),
+        submap=number,
+        relative=Gaussian(*(jnp.where(tried, x, 0) for x in relative)),
+        begun=due,
+        anew=anew,
         finished=finished,
+        edge=Gaussian(*(jnp.where(finished, x, 0) for x in edge)),
     )
     return belief, submaps, report
 
@@ -265,10 +275,10 @@ def _moved_bias(
     return Gaussian(belief.mean, mirrored(cov.at[bias, bias].add(kappa**2 * noise)))
 
 
-def _between_anchors(belief: Gaussian, older: int, younger: int) -> Gaussian:
-    """The younger anchor in the frame of the older."""
-    a, b = (slice(start, start + POSE) for start in (older, younger))
-    pose, by_a, by_b = between(belief.mean[a], belief.mean[b])
+def _between(belief: Gaussian, a: int, b: int) -> Gaussian:
+    """The pose at one entry of the state in the frame of that at another."""
+    first, second = slice(a, a + POSE), slice(b, b + POSE)
+    pose, by_first, by_second = between(belief.mean[first], belief.mean[second])
     H = jnp.zeros((POSE, len(belief.mean)), pose.dtype)
-    H = H.at[:, a].set(by_a.array(pose.dtype)).at[:, b].set(by_b.array(pose.dtype))
+    H = H.at[:, first].set(by_first.array(pose.dtype)).at[:, second].set(by_second.array(pose.dtype))
     return Gaussian(pose, mirrored(H @ belief.cov @ H.T))

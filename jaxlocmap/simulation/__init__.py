@@ -18,6 +18,7 @@ from jaxlocmap.simulation.robot import (
     targets,
 )
 from jaxlocmap.simulation.scenario import (
+    BUILDING,
     CAPSTONE,
     LOOP,
     SCENARIOS,
@@ -28,9 +29,10 @@ from jaxlocmap.simulation.scenario import (
     own_motion,
     own_params,
 )
-from jaxlocmap.simulation.world import World, occupancy, random_room, ray_cast, room
+from jaxlocmap.simulation.world import World, building, occupancy, random_room, ray_cast, room
 
 __all__ = [
+    "BUILDING",
     "CAPSTONE",
     "LOOP",
     "SCENARIOS",
@@ -39,6 +41,7 @@ __all__ = [
     "Noise",
     "Scenario",
     "World",
+    "building",
     "course_params",
     "detect",
     "draw_detection",

@@ -202,4 +202,34 @@ LOOP = Scenario(
 """Two laps of a circle of 3 m around the box, through free space: the steady state of a filter. Its prior is honest:
 the true start is drawn from it."""
 
-SCENARIOS = {scenario.name: scenario for scenario in (CAPSTONE, LOOP)}
+_TOUR = np.array(
+    [
+        *((5, 10), (29, 10), (29, 6), (27, 4), (11, 4), (7, 4), (5, 6), (5, 10), (5, 14), (7, 16), (11, 16), (27, 16)),
+        *((29, 14), (29, 10), (17, 10), (5, 10)),
+    ],
+    float,
+)  # m, corners of a closed path through the building
+_TOUR_SPEED, _TOUR_AHEAD = 0.48, 0.5  # m/s along it; m that the point steered for is ahead at the start
+
+
+def _tour_command(k: jax.Array, pose: jax.Array) -> jax.Array:
+    """Round the building after a point that moves along the tour, steered by the true pose."""
+    lengths = np.hypot(*np.diff(_TOUR, axis=0).T)
+    marks = jnp.asarray(np.concatenate([[0.0], np.cumsum(lengths)]), pose.dtype)
+    along = jnp.mod(_TOUR_SPEED * 0.1 * k.astype(pose.dtype) + _TOUR_AHEAD, float(lengths.sum()))
+    dx, dy = (jnp.interp(along, marks, jnp.asarray(_TOUR[:, i], pose.dtype)) - pose[i] for i in (0, 1))
+    bearing = wrap(arctan2(dy, dx) - pose[2])
+    v = jnp.clip(jnp.hypot(dx, dy), 0, 0.6) * jnp.maximum(jnp.cos(bearing), 0)
+    return jnp.stack([v, jnp.clip(1.5 * bearing, -1.0, 1.0)])
+
+
+BUILDING = Scenario(
+    name="building",
+    steps=7200,
+    command=_tour_command,
+    start=(5.0, 10.0, 0.0),
+    robot=Config(grid=GridSpec(origin=(-1.0, -1.0), resolution=0.2, shape=(110, 180))),
+)
+"""Three rounds through the rooms and the corridor of `world.building`, where there is no landmark."""
+
+SCENARIOS = {scenario.name: scenario for scenario in (CAPSTONE, LOOP, BUILDING)}

@@ -34,6 +34,39 @@ def room() -> World:
     )
 
 
+def building() -> World:
+    """A building of 34 x 20 m: a corridor along its middle, three rooms on either side, doors of 1.2 m, furniture, and no
+    landmark.
+    """
+    doors = (5.0, 17.0, 29.0)
+    edges = [0.0, *(x + side for x in doors for side in (-0.6, 0.6)), 34.0]
+    walls = [
+        ((0.0, 0.0), (34.0, 0.0)),
+        ((34.0, 0.0), (34.0, 20.0)),
+        ((34.0, 20.0), (0.0, 20.0)),
+        ((0.0, 20.0), (0.0, 0.0)),
+    ]
+    for y in (8.8, 11.2):
+        walls += [((a, y), (b, y)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    for x in (11.0, 23.0):
+        for low, high, door in ((0.0, 8.8, 4.0), (11.2, 20.0, 16.0)):
+            walls += [((x, low), (x, door - 0.6)), ((x, door + 0.6), (x, high))]
+    furniture = [
+        (2.0, 1.0, 3.5, 2.0),
+        (8.0, 6.0, 9.0, 7.5),
+        (14.0, 6.0, 15.0, 7.5),
+        (19.0, 1.0, 21.0, 2.0),
+        (31.0, 2.0, 32.5, 5.0),
+        (26.0, 18.0, 28.0, 19.0),
+        (13.0, 13.0, 14.5, 14.0),
+        (6.5, 18.0, 9.0, 19.0),
+    ]
+    for x0, y0, x1, y1 in furniture:
+        ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+        walls += [(ring[i], ring[(i + 1) % 4]) for i in range(4)]
+    return World(segments=jnp.array(walls), landmarks=jnp.zeros((0, 2)))
+
+
 def random_room(key: jax.Array) -> World:
     """`room` with its box elsewhere, half a metre or more from the walls, its sides 1 to 4 m long. The same landmarks.
 
