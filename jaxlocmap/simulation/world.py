@@ -35,7 +35,7 @@ def room() -> World:
 
 
 def building() -> World:
-    """A building of 34 x 20 m: a corridor along its middle, three rooms on either side, doors of 1.2 m, furniture, and no
+    """A building of 34 x 20 m: a corridor along its middle, three rooms on either side, doors of 1.2 m, furniture, no
     landmark.
     """
     doors = (5.0, 17.0, 29.0)
