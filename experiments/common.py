@@ -191,6 +191,11 @@ def scenario_of(name: str) -> simulation.Scenario:
     return simulation.SCENARIOS[name]
 
 
+def scenario_world(scenario: simulation.Scenario) -> simulation.World:
+    """What stands around the robot of a scenario."""
+    return simulation.building() if scenario.name == simulation.BUILDING.name else simulation.room()
+
+
 def check_gate(gate: float | None, name: str = "gate") -> None:
     """Raise unless this is what a gate can let in.
 

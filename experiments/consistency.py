@@ -22,38 +22,61 @@ from common import (
     progress_bar,
     saved,
     scenario_of,
+    scenario_world,
     show,
     start,
     study,
     study_checkpoint,
     write_report,
 )
-from report_table import band, innovation_rows, pose_rows, print_verdicts
+from report_table import band, innovation_rows, match_rows, pose_rows, print_verdicts
 
 from jaxlocmap import Config, Params, init, plotting, run, simulation
 from jaxlocmap.consistency import readable
 from jaxlocmap.consistency.study import Study, reference_study, summarise
+from jaxlocmap.matching.submaps import with_defaults
 from jaxlocmap.monte_carlo import monte_carlo
+from jaxlocmap.simulation import World
+from jaxlocmap.types import Matcher
 
 _REFERENCE_RUNS = 2000, 20_000  # at least and at most
+_EXACT = (1e-3, 1e-3, 1e-3)  # m, m, rad
+_GAP = 0.8  # m: the ends of the course's 61 beams lie far apart
+# What a study can be resumed by.
+_SETTINGS = (
+    *("scenario", "motion", "gate", "start", "map", "seed"),
+    *("steps", "own_noise", "exact_prior", "landmarks", "match", "match_every"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class ConsistencyConfig:
     """Settings of the study."""
 
-    scenario: Literal["capstone", "loop"] = "capstone"
-    """The drive: the course's, or two laps through free space."""
+    scenario: Literal["capstone", "loop", "building"] = "capstone"
+    """The drive: the course's, two laps through free space, or rounds of a building without landmarks."""
+    steps: int | None = None
+    """How many steps of 0.1 s; by default as the scenario has it."""
     motion: Literal["arc", "euler", "capstone"] = "arc"
     """The filter's motion model."""
     runs: int = 2000
     """How many simulated runs."""
     params: Path | None = None
     """JSON file of Q, R, l_occ, l_free; the course's by default."""
+    own_noise: bool = False
+    """Without a file: the noise the robot has, not the one the course's filter believes in."""
     gate: float | None = 0.99
     """Probability with which a good observation passes the gate; None for no gate."""
     start: Literal["exact", "drawn"] | None = None
     """The true start: exactly the prior's mean, or drawn from the prior; by default as the scenario has it."""
+    exact_prior: bool = False
+    """The filter knows the start, to a millimetre and a milliradian."""
+    landmarks: bool = True
+    """The robot observes the landmarks."""
+    match: bool = False
+    """Match scans on submaps."""
+    match_every: int = 5
+    """Steps between two matches."""
     map: bool = True
     """Map as well, and score the map."""
     seed: int = 0
@@ -72,15 +95,25 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     scenario = scenario_of(config.scenario)
     if config.start is not None:
         scenario = dataclasses.replace(scenario, exact_prior=config.start == "exact")
+    if config.steps is not None:
+        scenario = dataclasses.replace(scenario, steps=config.steps)
+    if config.exact_prior:
+        scenario = dataclasses.replace(scenario, exact_prior=False, prior_std=_EXACT)
     if config.runs < 1:
         raise ValueError(f"runs: expected at least 1, got {config.runs}")
     runs = min(config.runs, 100) if config.quick else config.runs
     start(config.compute)
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=config.map)
-    params = params_or(config.params, simulation.course_params())
-    world, noise, prior = simulation.room(), simulation.Noise(), scenario.prior()
+    world, noise, prior = scenario_world(scenario), simulation.Noise(), scenario.prior()
+    if not config.landmarks:
+        world = world._replace(landmarks=world.landmarks[:0])
+    own = simulation.own_params(noise, scenario)
+    params = params_or(config.params, own if config.own_noise else simulation.course_params())
+    if config.match:
+        settings = dataclasses.replace(settings, matcher=Matcher(period=config.match_every, gap=_GAP))
+        params = with_defaults(params)
     key = jax.random.key(config.seed)
-    named = {name: getattr(config, name) for name in ("scenario", "motion", "gate", "start", "map", "seed")}
+    named = {name: getattr(config, name) for name in _SETTINGS}
     checkpoint = study_checkpoint(out, config.compute, named)
     CONSOLE.print(f"{runs} runs of {scenario.name}, {scenario.steps} steps each")
 
@@ -92,7 +125,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         "scenario": scenario.name,
         "motion": config.motion,
         "prior": "exact" if scenario.exact_prior else "drawn",
-        **summarise(totals.value, settings, _reference(scenario, settings, config, runs)),
+        **summarise(totals.value, settings, _reference(scenario, settings, config, world, runs)),
         "params": params.numbers(),
         "seed": config.seed,
         **how_computed(totals, runs, began),
@@ -102,7 +135,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         plotting.study_figure(out / "nees.png", report, scenario.dt)
         files = ["report.json", "nees.png"]
         if config.map:
-            _picture_of_one_run(out / "map.png", key, params, scenario, settings)
+            _picture_of_one_run(out / "map.png", key, params, world, scenario, settings)
             files.append("map.png")
         _print(report)
         saved(out, *files)
@@ -110,24 +143,29 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     return report
 
 
-def _reference(scenario: simulation.Scenario, settings: Config, config: ConsistencyConfig, runs: int) -> Any:
-    """What this start and this gate make of a filter told the robot's own noise; None where they make nothing of it."""
-    if not scenario.exact_prior and config.gate is None:
+def _reference(
+    scenario: simulation.Scenario, settings: Config, config: ConsistencyConfig, world: World, runs: int
+) -> Any:
+    """What this start and this gate make of a filter told the robot's own noise; None where they make nothing of it,
+    and where scans are matched, which takes too long.
+    """
+    gated = config.gate is not None and len(world.landmarks) > 0
+    if config.match or not (scenario.exact_prior or gated):
         return None
     noise, count = simulation.Noise(), min(max(runs, _REFERENCE_RUNS[0]), _REFERENCE_RUNS[1])
     told, params = reference_study(scenario, settings, noise)
     key = jax.random.fold_in(jax.random.key(config.seed), 1)  # other drives, so that errors are independent
     devices = jax.local_devices()[: config.compute.devices]
     with progress_bar("simulating a filter told the robot's own noise", count) as progress:
-        args = params, simulation.room(), noise, scenario.prior()
+        args = params, world, noise, scenario.prior()
         return monte_carlo(told, key, count, *args, devices=devices, progress=progress).value
 
 
 def _picture_of_one_run(
-    path: Path, key: jax.Array, params: Params, scenario: simulation.Scenario, settings: Any
+    path: Path, key: jax.Array, params: Params, world: World, scenario: simulation.Scenario, settings: Any
 ) -> None:
     """The map and path of one more run of the same study, started at the prior's mean."""
-    world, prior = simulation.room(), scenario.prior()
+    prior = scenario.prior()
     truth, inputs = simulation.simulate(key, world, simulation.Noise(), prior.mean, scenario=scenario)
     state, beliefs = jax.jit(run, static_argnames=("config", "collect"))(
         params,
@@ -171,6 +209,8 @@ def _print(report: dict[str, Any]) -> None:
         *innovation_rows(report),
         ("flagged steps", str(report["flagged_steps"]), "0"),
     ]
+    if "matches" in report:
+        rows += match_rows(report)
     for phase in report["nees_phases"]:
         low, high = phase["band_95"]
         name = f"NEES from {phase['from_s']:.4g} to {phase['to_s']:.4g} s"

@@ -147,10 +147,8 @@ def short_form_run(
             corrected = jax.lax.cond(any_in_batch(now.valid), correct, lambda: belief)
             return Observed(corrected, None, jnp.zeros((), belief.mean.dtype), jnp.array(True))
 
-        state, _, ok = turn(
-            params, state, now.control, now.dt, observe=observe, ranges=None, beam_angles=None, config=config
-        )
-        return state, (state.belief, ok)
+        turned = turn(params, state, now.control, now.dt, observe=observe, ranges=None, beam_angles=None, config=config)
+        return turned.state, (turned.state.belief, turned.ok)
 
     return jax.lax.scan(body, state, inputs)
 

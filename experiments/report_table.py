@@ -66,6 +66,24 @@ def innovation_rows(report: dict[str, Any]) -> Rows:
     return rows
 
 
+def match_rows(report: dict[str, Any]) -> Rows:
+    """Matches, and the poses that they tell: relative to a submap's anchor, and between anchors."""
+    rows = [
+        ("matches let in", f"{100 * report['match_accept_rate']:.2f} % of {report['matches']:,}", ""),
+        ("NIS of a match", f"{report['match_nis_mean']:.3f}", "up to 3"),
+        ("submaps begun anew", str(report["submaps_begun_anew"]), "0"),
+    ]
+    for name, words in (("relative", "relative to the anchor"), ("edge", "between anchors")):
+        error, sigma = (1000 * report[f"{name}_{what}_position_m"] for what in ("rmse", "sigma"))
+        yaw, yaw_sigma = (1000 * report[f"{name}_{what}_yaw_rad"] for what in ("rmse", "sigma"))
+        rows += [
+            (f"ANEES {words}", readable(report[f"{name}_anees"], 4), band(report, f"{name}_anees_band_95")),
+            (f"position RMSE {words}", f"{error:.3g} mm", f"σ {sigma:.3g} mm"),
+            (f"yaw RMSE {words}", f"{yaw:.3g} mrad", f"σ {yaw_sigma:.3g} mrad"),
+        ]
+    return rows
+
+
 def print_verdicts(report: dict[str, Any]) -> None:
     """What the report says of the covariance, and of the gate if it knows of one."""
     CONSOLE.print(report["verdict"], style="bold")
