@@ -63,6 +63,26 @@ def test_a_covariance_stays_semi_definite(seed, tolerance):
     assert np.linalg.eigvalsh(np.asarray(cov, float))[0] > -tolerance(1e-12, 1e-3)
 
 
+def test_a_turn_of_the_whole_world_stays_unknown_whatever_is_seen_of_two_poses(tolerance):
+    """Two poses that turn together about the origin, and what is observed of one in the frame of the other. The mean
+    moves with every correction; the covariance along that turn must not shrink.
+    """
+
+    def known(mean, cov):
+        """Information on a turn of the world, by which both poses move: tᵀ P⁻¹ t."""
+        turn = np.concatenate([[-mean[1], mean[0], 1.0], [-mean[4], mean[3], 1.0], np.zeros(3)])
+        return turn @ np.linalg.solve(np.asarray(cov, float), turn)
+
+    mean, cov = jnp.array([4.0, 1.0, 0.3, 2.0, 3.0, -0.4, 0.0, 0.0, 0.0]), jnp.asarray(random_cov(7, 9))
+    before = known(mean, cov)
+    for k in range(20):
+        _, H = submaps.relative_pose(mean, 3)
+        told, pull = jnp.diag(jnp.array([100.0, 400.0, 900.0])), jnp.asarray(30 * np.sin(np.arange(3.0) + k))
+        start, (mean, cov) = mean, information.update(mean, cov, H, told, pull, angles=(2, 5), poses=(0, 3))
+        assert np.abs(mean - start).max() > 1e-3
+    np.testing.assert_allclose(known(mean, cov), before, rtol=tolerance(1e-9, 2e-2))
+
+
 # --- The entries of a submap ---
 
 

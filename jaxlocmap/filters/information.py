@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 
 from jaxlocmap import checks
 from jaxlocmap._internal.linalg import Matrix, inverse, mirrored
@@ -17,6 +18,7 @@ def update(
     gradient: jax.Array,
     *,
     angles: tuple[int, ...] = HEADING,
+    poses: tuple[int, ...] = (),
 ) -> tuple[jax.Array, jax.Array]:
     """Correct the belief by the log density of something observed of y = h(x), a quadratic about its expectation:
 
@@ -34,9 +36,14 @@ def update(
         information: (3, 3) Λ, positive semi-definite.
         gradient: (3,) g.
         angles: entries of the state that are angles, static.
+        poses: entries at which poses in the world begin, static: those that h observes relative to each other. Their
+            errors are taken for motions of the world about its origin, so that their covariance at the new mean is
+            another. A turn of the whole world, of which h tells nothing, then stays unknown however often h is
+            observed at means that differ.
 
     Returns:
-        mean (n,), cov (n, n), symmetric. Source: Maybeck 1979, section 5.7 (the information form).
+        mean (n,), cov (n, n), symmetric. Source: Maybeck 1979, section 5.7 (the information form); Barrau & Bonnabel
+        2017 (errors as motions of the world).
 
     Raises:
         ValueError: a wrong shape.
@@ -49,4 +56,10 @@ def update(
     K = C @ information
     rest = K @ PH.T
     cov = cov - rest - rest.T + K @ (H @ PH) @ K.T + C @ information @ C.T
-    return wrap_entries(mean + C @ gradient, angles), mirrored(cov)
+    shift = C @ gradient
+    T = jnp.eye(n, dtype=cov.dtype)
+    for i in poses:
+        T = T.at[i, i + 2].set(-shift[i + 1]).at[i + 1, i + 2].set(shift[i])
+    if poses:
+        cov = T @ cov @ T.T
+    return wrap_entries(mean + shift, angles), mirrored(cov)

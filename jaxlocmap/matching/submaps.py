@@ -171,7 +171,8 @@ def match_scan(
         tried & (nis < gate) & (found.used.astype(nis.dtype) >= matcher.least_share * found.points.astype(nis.dtype))
     )
     gradient = found.information @ moved + found.score
-    corrected = information.update(*belief, H, found.information, gradient, angles=angles)
+    poses = (0, older, younger)
+    corrected = information.update(*belief, H, found.information, gradient, angles=angles, poses=poses)
     belief = _chosen(accepted, Gaussian(*corrected), belief)
     refused = jnp.where(accepted, 0, submaps.refused + tried.astype(jnp.int32))
 
