@@ -72,7 +72,7 @@ def score_match(
         accepted=report.accepted.astype(dtype),
         nis=report.nis,
         used=tried * report.used.astype(dtype) / jnp.maximum(report.points, 1).astype(dtype),
-        anew=(report.anew & (report.submap > 0)).astype(dtype),
+        anew=(report.anew & (report.submap >= 0)).astype(dtype),
         pose=_relative(anchors[0], truth, report.relative, report.tried),
         edge=_relative(*anchors, report.edge, report.finished),
     )
