@@ -124,13 +124,14 @@ class Matcher:
 
     period: int = 1  # steps between two matches, the first at step 0; >= 1
     submap_scans: int = 10  # a new submap begins that often, and lives twice as long; >= 2
+    submap_length: float = 4.0  # m of travel, > 0, a turn of a radian counted as half a metre: or after that
     resolution: float = 0.1  # m per cell, > 0
     half_width: float = 12.0  # m of a submap about its anchor: the reach of a scan and some travel; > resolution
     gap: float = 0.5  # m, > 0: ends of neighbouring beams farther apart than this lie on two surfaces
     steps: int = 10  # of Gauss-Newton; >= 1
     gate_probability: float = 0.999  # in (0, 1): share of good matches let in
     least_points: int = 10  # with a normal, that a scan must have; >= 1
-    least_share: float = 0.4  # in (0, 1), of a scan's points that must lie on lines of the submap
+    least_share: float = 0.2  # in (0, 1), of a scan's points that must lie on lines of the submap
     patience: int = 5  # matches refused in a row before the submaps are begun anew; >= 1
 
     def __post_init__(self) -> None:
@@ -143,7 +144,7 @@ class Matcher:
         for name in ("gate_probability", "least_share"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"Matcher.{name}: expected a value inside (0, 1), got {getattr(self, name)}")
-        for name in ("resolution", "gap", "half_width"):
+        for name in ("resolution", "gap", "submap_length", "half_width"):
             least = self.resolution if name == "half_width" else 0
             if not least < getattr(self, name) < math.inf:
                 raise ValueError(f"Matcher.{name}: expected finite metres > {least}, got {getattr(self, name)}")

@@ -249,7 +249,7 @@ def test_at_the_optimum_scan_and_belief_balance(tolerance):
 
 def test_a_pose_known_exactly_stays():
     got = in_room((2.0, 2.0, 0.8), (0.05, -0.03, 0.02), cov=jnp.zeros((3, 3)), mean=(0.01, 0.02, 0.03))
-    np.testing.assert_array_equal(got.pose, [0.01, 0.02, 0.03])
+    np.testing.assert_array_equal(got.pose, jnp.array([0.01, 0.02, 0.03]))
 
 
 def test_in_a_corridor_the_pose_stays_along_it_and_nothing_is_claimed(tolerance):
@@ -271,6 +271,6 @@ def test_a_scan_without_points_leaves_the_belief():
     nothing = seen(jnp.full(61, 8.0))
     drawn = add(jnp.asarray(EMPTY), jnp.zeros(3), seen(ranges_in_room((2.0, 2.0, 0.8))))
     got = match(drawn, jnp.array([0.1, 0.2, 0.3]), WIDE, nothing, jnp.asarray(STD), jnp.asarray(SCALE))
-    np.testing.assert_array_equal(got.pose, [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(got.pose, jnp.array([0.1, 0.2, 0.3]))
     assert not np.any(got.information)
     assert got.points == got.used == 0

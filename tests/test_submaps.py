@@ -139,7 +139,7 @@ def test_the_bias_moves_towards_the_error_of_the_pose_a_scan_is_added_at(toleran
     belief = Gaussian(jnp.asarray(mean), jnp.asarray(P))
     got = submaps._moved_bias(belief, 9, jnp.asarray(kappa), H, jnp.asarray(rel), jnp.asarray(told))
     np.testing.assert_allclose(got.cov, expected, rtol=0, atol=tolerance(1e-9, 1e-3))
-    np.testing.assert_array_equal(got.mean, mean)
+    np.testing.assert_array_equal(got.mean, belief.mean)
 
 
 # --- In the filter ---
@@ -315,6 +315,7 @@ def test_a_run_in_pieces_is_one_run(matched, tolerance):
         ({"half_width": 0.05}, "half_width"),
         ({"resolution": 0.0}, "resolution"),
         ({"gap": np.inf}, "gap"),
+        ({"submap_length": 0.0}, "submap_length"),
     ],
 )
 def test_a_setting_out_of_range_is_named(wrong, name):

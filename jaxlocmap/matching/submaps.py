@@ -43,6 +43,7 @@ class Submaps(NamedTuple):
     older: jax.Array  # () int32: which of the two is the older one
     scans: jax.Array  # (2,) int32: in the older, in the younger one
     travel: jax.Array  # () m: since the last scan was added, turns counted
+    length: jax.Array  # () m: since the last submap began, turns counted
     steps: jax.Array  # () int32: of the filter so far
     refused: jax.Array  # () int32: matches refused in a row
     begun: jax.Array  # () int32: submaps so far
@@ -84,7 +85,8 @@ def empty(matcher: Matcher, dtype: np.dtype) -> Submaps:
     rows, columns = matcher.spec.shape
     none = jnp.zeros((), jnp.int32)
     lines = jnp.zeros((2 * rows, columns, line_grid.SUMS), dtype)
-    return Submaps(lines, none, jnp.zeros(2, jnp.int32), jnp.zeros((), dtype), none, none, none)
+    path = jnp.zeros((), dtype)
+    return Submaps(lines, none, jnp.zeros(2, jnp.int32), path, path, none, none, none)
 
 
 def no_match(dtype: np.dtype) -> MatchReport:
@@ -106,7 +108,8 @@ def travelled(submaps: Submaps, before: jax.Array, after: jax.Array) -> Submaps:
     """The submaps after the robot moved from one state (n,) to the next."""
     turn = jnp.abs(wrap(after[2] - before[2]))
     path = jnp.sqrt((after[0] - before[0]) ** 2 + (after[1] - before[1]) ** 2 + jnp.finfo(after.dtype).tiny)
-    return submaps._replace(travel=submaps.travel + path + _TURN * turn)
+    path = path + _TURN * turn
+    return submaps._replace(travel=submaps.travel + path, length=submaps.length + path)
 
 
 def relative_pose(mean: jax.Array, anchor: int) -> tuple[jax.Array, jax.Array]:
@@ -181,6 +184,7 @@ def match_scan(
     # Begin submaps: the first, the next, or anew after too many refusals.
     active = submaps.scans[1] > 0
     full = submaps.scans[jnp.where(active, 1, 0)] >= matcher.submap_scans
+    full = full | (submaps.length >= matcher.submap_length)
     anew = usable & ((submaps.scans[0] == 0) | (refused >= matcher.patience))
     due = accepted & full
     finished = due & active
@@ -214,6 +218,7 @@ def match_scan(
         older=which,
         scans=scans,
         travel=jnp.where(jnp.any(added), 0, submaps.travel),
+        length=jnp.where(due | anew, 0, submaps.length),
         steps=submaps.steps,
         refused=jnp.where(anew, 0, refused),
         begun=submaps.begun + (due | anew).astype(jnp.int32),
