@@ -189,7 +189,7 @@ def _picture_of_one_run(
 
 def _poses(state: Any, info: Any, aside: Any) -> jax.Array:
     del state, aside
-    return info.belief.mean
+    return info.belief.pose.mean
 
 
 def _print(report: dict[str, Any]) -> None:
@@ -206,7 +206,7 @@ def _print(report: dict[str, Any]) -> None:
             f"{100 * report['nees_steps_in_band']:.1f} % {band(report, 'nees_steps_in_band_interval_95', 100)}",
             "95 %",
         ),
-        *innovation_rows(report),
+        *(innovation_rows(report) if report["observations"] else ()),
         ("flagged steps", str(report["flagged_steps"]), "0"),
     ]
     if "matches" in report:

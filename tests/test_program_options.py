@@ -60,7 +60,10 @@ def handed_to_the_study(monkeypatch, program, config):
     return given, named
 
 
-CONSISTENCY = {"scenario": "capstone", "motion": "arc", "gate": 0.99, "start": None, "map": True, "seed": 0}
+CONSISTENCY = (
+    *("scenario", "motion", "gate", "start", "map", "seed"),
+    *("steps", "own_noise", "exact_prior", "landmarks", "match", "match_every"),
+)
 
 
 @pytest.mark.parametrize(
@@ -78,6 +81,14 @@ CONSISTENCY = {"scenario": "capstone", "motion": "arc", "gate": 0.99, "start": N
         ({"start": "exact", "scenario": "loop"}, {"name": "loop", "exact": True}),
         ({"map": False}, {"map": False}),
         ({"seed": 5}, {"seed": 5}),
+        ({"steps": 33}, {"steps": 33}),
+        ({"exact_prior": True}, {"exact": False, "prior_std": (1e-3, 1e-3, 1e-3)}),
+        ({"own_noise": True}, {"own": True}),
+        ({"landmarks": False}, {"landmarks": 0}),
+        ({"scenario": "building"}, {"name": "building", "steps": 7200, "landmarks": 0, "walls": 52}),
+        ({"match": True}, {"period": 5, "blocks": 3}),
+        ({"match": True, "match_every": 2}, {"period": 2, "blocks": 3}),
+        ({"match_every": 2}, {}),
     ],
     ids=str,
 )
@@ -85,7 +96,17 @@ def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
     config = consistency.ConsistencyConfig(**options, out=tmp_path, compute=common.ComputeConfig(chunk=3))
     (study, key, runs, params, world, noise, prior), named = handed_to_the_study(monkeypatch, consistency, config)
     expected = {"name": "capstone", "exact": True, "motion": "arc", "runs": 2000, "gate": 0.99, "map": True, "seed": 0}
+    expected |= {"steps": 1200 if study.scenario.name == "loop" else 240, "landmarks": 4, "walls": 8, "own": False}
+    expected |= {"period": None, "blocks": 0, "prior_std": simulation.CAPSTONE.prior_std}
+    course, own = simulation.course_params(), simulation.own_params(noise, study.scenario)
     assert {
+        "steps": study.scenario.steps,
+        "prior_std": study.scenario.prior_std,
+        "landmarks": len(world.landmarks),
+        "walls": len(world.segments),
+        "own": not np.array_equal(params.Q, course.Q) and np.array_equal(params.Q, own.Q),
+        "period": study.config.matcher and study.config.matcher.period,
+        "blocks": len(params.blocks),
         "name": study.scenario.name,
         "exact": study.scenario.exact_prior,
         "motion": study.config.motion,
@@ -95,8 +116,6 @@ def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
         "seed": config.seed,
     } == expected | fields
     assert same_key(key, config.seed)
-    np.testing.assert_array_equal(params.R, simulation.course_params().R)
-    np.testing.assert_array_equal(world.landmarks, simulation.room().landmarks)
     assert noise == simulation.Noise()
     np.testing.assert_allclose(prior.mean, study.scenario.start, rtol=1e-6)
     assert named == {name: getattr(config, name) for name in CONSISTENCY}
@@ -125,9 +144,9 @@ def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
     report = consistency.main(config)
     ((totals, settings, told), _) = summarise.calls[0]
     assert (totals, settings.gate_probability, settings.motion, told) == ("totals", 0.9, "euler", "reference")
-    ((scenario, same, given, runs), _) = reference_of.calls[0]
+    ((scenario, same, given, _, runs), _) = reference_of.calls[0]
     assert (scenario.exact_prior, same, given, runs) == (True, settings, config, 50)
-    ((path, key, params, drawn, how), _) = pictured.calls[0]
+    ((path, key, params, _, drawn, how), _) = pictured.calls[0]
     assert (path, drawn, how) == (tmp_path / "map.png", scenario, settings)
     assert same_key(key, 6)
     np.testing.assert_allclose(params.R, plant[1].R, rtol=1e-6)
@@ -169,7 +188,7 @@ def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     scenario = simulation.CAPSTONE
     settings = scenario.config(motion="arc", gate_probability=0.9, grid=True)
     config = consistency.ConsistencyConfig(seed=3, gate=0.9, compute=common.ComputeConfig(devices=1))
-    assert consistency._reference(scenario, settings, config, runs) == "reference"
+    assert consistency._reference(scenario, settings, config, simulation.room(), runs) == "reference"
     ((study, key, asked, params, *_), how) = ran.calls[0]
     assert asked == count
     assert not same_key(key, 3)
@@ -181,13 +200,26 @@ def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     assert how["devices"] == jax.local_devices()[:1]
 
 
-@pytest.mark.parametrize(("exact", "gate", "needed"), [(True, None, True), (False, 0.9, True), (False, None, False)])
-def test_a_reference_is_run_where_start_or_gate_make_something_of_a_filter(monkeypatch, exact, gate, needed):
+@pytest.mark.parametrize(
+    ("exact", "gate", "landmarks", "match", "needed"),
+    [
+        (True, None, 4, False, True),
+        (False, 0.9, 4, False, True),
+        (False, None, 4, False, False),
+        (False, 0.9, 0, False, False),
+        (True, 0.9, 4, True, False),
+    ],
+)
+def test_a_reference_is_run_where_start_or_gate_make_something_of_a_filter(
+    monkeypatch, exact, gate, landmarks, match, needed
+):
     monkeypatch.setattr(consistency, "monte_carlo", Recorder(SimpleNamespace(value="reference")))
     scenario = dataclasses.replace(simulation.LOOP, exact_prior=exact)
     settings = scenario.config(gate_probability=gate)
-    config = consistency.ConsistencyConfig(gate=gate)
-    assert (consistency._reference(scenario, settings, config, 10) is not None) == needed
+    config = consistency.ConsistencyConfig(gate=gate, match=match)
+    room = simulation.room()
+    world = room._replace(landmarks=room.landmarks[:landmarks])
+    assert (consistency._reference(scenario, settings, config, world, 10) is not None) == needed
 
 
 class Mapped(NamedTuple):
@@ -203,7 +235,8 @@ def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     monkeypatch.setattr(consistency, "run", lambda params, state, inputs, **how: ran(params.R[0, 0], inputs, **how))
     monkeypatch.setattr(consistency.plotting, "map_figure", figure := Recorder())
     key = jax.random.key(6)
-    consistency._picture_of_one_run(tmp_path / "a.png", key, simulation.course_params(), scenario, settings)
+    room = simulation.room()
+    consistency._picture_of_one_run(tmp_path / "a.png", key, simulation.course_params(), room, scenario, settings)
     ((given, world, noise, start), how) = drove.calls[0]
     assert same_key(given, 6)
     assert (noise, how) == (simulation.Noise(), {"scenario": scenario})
@@ -215,7 +248,8 @@ def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     assert (path, grid) == (tmp_path / "a.png", settings.grid)
     assert (log_odds.tolist(), beliefs[0].tolist(), how["truth"][0].tolist()) == ([[3, 3], [3, 3]], [5] * 3, [2] * 3)
     np.testing.assert_array_equal(how["segments"], world.segments)
-    assert consistency._poses(None, SimpleNamespace(belief=SimpleNamespace(mean="mean")), None) == "mean"
+    belief = SimpleNamespace(pose=SimpleNamespace(mean="mean"))
+    assert consistency._poses(None, SimpleNamespace(belief=belief), None) == "mean"
 
 
 def test_what_consistency_shows(monkeypatch):
@@ -224,7 +258,12 @@ def test_what_consistency_shows(monkeypatch):
     monkeypatch.setattr(consistency.CONSOLE, "print", said := Recorder())
     monkeypatch.setattr(consistency, "pose_rows", lambda report: [("p", "", "")])
     monkeypatch.setattr(consistency, "innovation_rows", lambda report: [("i", "", "")])
-    report = {"anees_median_run": 2.5, "anees_undiverged": 3.25, "anees_undiverged_interval_95": (3.0, 3.5)}
+    report = {
+        "observations": 5,
+        "anees_median_run": 2.5,
+        "anees_undiverged": 3.25,
+        "anees_undiverged_interval_95": (3.0, 3.5),
+    }
     report |= {"nees_steps_in_band": 0.945, "nees_steps_in_band_interval_95": (0.9, 0.97), "flagged_steps": 6}
     phase = {"from_s": 1.0, "to_s": 2.5, "anees": 4.5, "band_95": (2.75, 3.25)}
     report |= {"nees_phases": [phase], "map": {"entropy_bits": 1234.5, "brier": 0.0625, "brier_base_rate": 0.125}}
