@@ -1,4 +1,4 @@
-"""One step: predict, observe, match, map. The order of a step stands in `turn` and nowhere else; there is no loop here."""
+"""One step: predict, observe, match, map. Its order stands in `turn` and nowhere else; there is no loop here."""
 
 from __future__ import annotations
 
