@@ -305,6 +305,23 @@ def test_a_prediction_of_the_wrong_shape_is_refused_by_name(name, wrong):
         ekf.predict(**{key: jnp.array(x) for key, x in whole.items()}, motion=motion.EULER, nominal_dt=0.1)
 
 
+def test_entries_beyond_the_motion_models_stand_still(tolerance):
+    """As if the model had them too, moved by nothing."""
+    rng = np.random.default_rng(2)
+    mean, L = rng.normal(size=7), rng.normal(size=(7, 7))
+    P, control, dt = L @ L.T, np.array([0.4, 0.3]), 0.2
+    mean[2] = 0.5
+    args = jnp.asarray(control), jnp.asarray(dt), jnp.asarray(Q)
+    got = ekf.predict(jnp.asarray(mean), jnp.asarray(P), *args, motion=motion.ARC, nominal_dt=0.1)
+    still = motion.from_transition(
+        lambda state, u, dt: jnp.concatenate([motion.ARC.transition(state[:3], u, dt), state[3:]]), dim=7
+    )
+    expected = ekf.predict(jnp.asarray(mean), jnp.asarray(P), *args, motion=still, nominal_dt=0.1)
+    for a, b in zip(got, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance(1e-12, 1e-4))
+    np.testing.assert_array_equal(got[0][3:], jnp.asarray(mean)[3:])
+
+
 @pytest.mark.parametrize("name", ["transition", "F", "G"])
 def test_a_motion_model_that_returns_something_else_is_refused_by_name(name):
     made = {"transition": (3,), "F": (3, 3), "G": (3, 2)} | {name: (2, 3)}

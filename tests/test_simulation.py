@@ -515,7 +515,23 @@ def test_the_loop_is_two_laps_whose_true_start_is_drawn_from_the_prior():
     assert LOOP.steps * LOOP.dt == 2 * 60
     assert (LOOP.exact_prior, CAPSTONE.exact_prior) == (False, True)
     np.testing.assert_allclose(LOOP.start, [9, 5.4, np.pi / 2])
-    assert simulation.SCENARIOS == {"capstone": CAPSTONE, "loop": LOOP}
+    assert simulation.SCENARIOS == {"capstone": CAPSTONE, "loop": LOOP, "building": simulation.BUILDING}
+
+
+def test_the_tour_of_the_building_goes_through_its_doors_and_no_wall():
+    """In a round of 4 minutes no wall is crossed between two steps, and none comes nearer than a third of a metre."""
+    scenario = dataclasses.replace(simulation.BUILDING, steps=2500)
+    walls = np.asarray(simulation.building().segments)
+    drive = jax.jit(functools.partial(simulation.simulate, scenario=scenario, scan=False))
+    truth, _ = drive(jax.random.key(0), simulation.building(), simulation.Noise(), jnp.asarray(scenario.start))
+    path = np.asarray(truth.pose)[:, None, :2]
+    a, along = walls[:, 0], walls[:, 1] - walls[:, 0]
+    share = np.clip(np.sum((path - a) * along, axis=-1) / np.sum(along**2, axis=-1), 0, 1)
+    distance = np.linalg.norm(path - (a + share[..., None] * along), axis=-1)
+    assert distance.min() > 1 / 3
+    assert np.linalg.norm(np.diff(path[:, 0], axis=0), axis=-1).max() < 0.07
+    for x, y in ((29, 4), (5, 6), (5, 14), (27, 16), (29, 10)):  # every room and the corridor
+        assert np.linalg.norm(path[:, 0] - (x, y), axis=-1).min() < 2.5
 
 
 def test_the_robot_s_own_noise_as_a_filter_has_it():

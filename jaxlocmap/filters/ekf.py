@@ -108,8 +108,7 @@ def predict(
         ValueError: a wrong shape, also of what the motion model returns.
     """
     n, q = motion.dim, motion.inputs
-    if len(mean) > n:
-        checks.shape("cov", cov, (len(mean), len(mean)))
+    if len(mean) > n and mean.shape * 2 == cov.shape:
         moved, front = predict(mean[:n], cov[:n, :n], control, dt, Q, motion=motion, nominal_dt=nominal_dt)
         F, _ = motion.jacobians(mean[:n], motion.full_input(control), dt)
         cross = (F.array(cov.dtype) if isinstance(F, Matrix) else F) @ cov[:n, n:]
