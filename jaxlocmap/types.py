@@ -129,6 +129,7 @@ class Matcher:
     half_width: float = 12.0  # m of a submap about its anchor: the reach of a scan and some travel; > resolution
     gap: float = 0.5  # m, > 0: ends of neighbouring beams farther apart than this lie on two surfaces
     steps: int = 10  # of Gauss-Newton; >= 1
+    window: tuple[float, float] | None = None  # m, rad, > 0: how far to search before; None: not
     gate_probability: float = 0.999  # in (0, 1): share of good matches let in
     least_points: int = 10  # with a normal, that a scan must have; >= 1
     least_share: float = 0.2  # in (0, 1), of a scan's points that must lie on lines of the submap
@@ -136,11 +137,16 @@ class Matcher:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            checks.number(field.name, getattr(self, field.name))
+            if field.name != "window":
+                checks.number(field.name, getattr(self, field.name))
         for name, least in (("period", 1), ("submap_scans", 2), ("steps", 1), ("least_points", 1), ("patience", 1)):
             value = getattr(self, name)
             if int(value) != value or value < least:
                 raise ValueError(f"Matcher.{name}: expected a whole number of at least {least}, got {value}")
+        if self.window is not None:
+            freeze_tuples(self, "window")
+            if len(self.window) != 2 or not all(0 < reach < math.inf for reach in self.window):
+                raise ValueError(f"Matcher.window: expected two finite numbers > 0, m and rad, got {self.window}")
         for name in ("gate_probability", "least_share"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"Matcher.{name}: expected a value inside (0, 1), got {getattr(self, name)}")

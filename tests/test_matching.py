@@ -274,3 +274,53 @@ def test_a_scan_without_points_leaves_the_belief():
     np.testing.assert_array_equal(got.pose, jnp.array([0.1, 0.2, 0.3]))
     assert not np.any(got.information)
     assert got.points == got.used == 0
+
+
+# --- Far off ---
+
+
+FAR = jnp.diag(jnp.array([0.2, 0.2, 0.12]) ** 2)
+search = jax.jit(functools.partial(scan_match.search, spec=SPEC), static_argnames="window")
+
+
+@pytest.mark.parametrize("other", [(0.45, -0.3, 0.2), (-0.4, 0.35, -0.25), (0.0, 0.0, 0.0)])
+def test_a_search_finds_the_neighbourhood_that_a_match_alone_does_not(other):
+    pose = np.array([6.0, 2.0, 0.3])
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    there = np.add(pose, (c * other[0] - s * other[1], s * other[0] + c * other[1], other[2]))
+    drawn = add(jnp.asarray(EMPTY), jnp.zeros(3), seen(ranges_in_room(pose)))
+    scan, mean, scale = seen(ranges_in_room(there)), jnp.zeros(3), jnp.asarray(SCALE)
+    start = search(drawn, mean, FAR, scan, scale, window=(0.7, 0.4))
+    off = np.abs(np.asarray(start) - other)
+    assert off[:2].max() < 0.12
+    assert off[2] < 0.06
+    found = match(drawn, mean, FAR, scan, jnp.asarray(STD), scale, start=start).pose
+    np.testing.assert_allclose(found, other, rtol=0, atol=0.01)
+    alone = match(drawn, mean, FAR, scan, jnp.asarray(STD), scale).pose
+    assert (np.abs(np.asarray(alone) - other).max() > 0.1) == any(other)
+
+
+def test_a_search_looks_no_farther_than_its_window_and_where_all_is_alike_stays():
+    pose = (2.0, 2.0, 0.8)
+    drawn, scan = (add(jnp.asarray(EMPTY), jnp.zeros(3), seen(ranges_in_room(pose))), seen(ranges_in_room(pose)))
+    scale = jnp.asarray(SCALE)
+    start = search(drawn, jnp.array([0.4, 0.0, 0.3]), FAR, scan, scale, window=(0.1, 0.05))
+    np.testing.assert_array_less(np.abs(np.asarray(start) - [0.4, 0.0, 0.3]), [0.1001, 0.1001, 0.0501])
+    mean = jnp.array([0.1, 0.2, 0.3])
+    nowhere = search(jnp.asarray(EMPTY), mean, FAR, scan, scale, window=(0.7, 0.4))
+    np.testing.assert_allclose(nowhere, mean, rtol=0, atol=1e-6)
+    known = search(drawn, mean, jnp.zeros((3, 3)), scan, scale, window=(0.7, 0.4))
+    np.testing.assert_allclose(known, mean, rtol=0, atol=1e-6)
+
+
+def test_points_are_counted_as_a_fit_weighs_them_where_cells_are_read_at_their_centres(tolerance):
+    """At a point on the centre of a cell, the nearest cell alone is what is read."""
+    n = 30
+    xy = np.stack([np.full(n, 1.05), 0.1 * np.arange(n) - 1.45], axis=1)
+    points = Points(jnp.asarray(xy), jnp.tile(jnp.array([1.0, 0.0]), (n, 1)), jnp.ones(n, bool))
+    drawn = add(jnp.asarray(EMPTY), jnp.array([0.03, 0.0, 0.0]), points)
+    there = lines.placed(jnp.zeros(3), points)
+    got = lines.overlap(drawn, jnp.zeros(2), there, jnp.asarray(SCALE), spec=SPEC)
+    expected = fit(drawn, jnp.zeros(3), points, jnp.asarray(SCALE))
+    np.testing.assert_allclose(got, expected.weight.sum(), rtol=tolerance(1e-9, 1e-4))
+    assert float(got) == pytest.approx(n / (1 + (0.03 / SCALE) ** 2), rel=1e-4)

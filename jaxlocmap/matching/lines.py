@@ -61,7 +61,7 @@ def add_points(
         ValueError: a wrong shape.
     """
     rows, columns = _check(lines, pose, points, spec)
-    x, y, normal_x, normal_y, _, _ = _placed(pose, points)
+    x, y, normal_x, normal_y, *_ = placed(pose, points)
     (column, u), (row, v) = _in_cells(x, y, spec)
     index, sums = [], []
     for i in (-1, 0, 1, 2):
@@ -100,7 +100,7 @@ def fit(
     """
     rows, columns = _check(lines, pose, points, spec)
     checks.shape("scale", scale, ())
-    x, y, normal_x, normal_y, arm_x, arm_y = _placed(pose, points)
+    x, y, normal_x, normal_y, arm_x, arm_y, _ = placed(pose, points)
     (column, u), (row, v) = _in_cells(x, y, spec)
     inside = (row >= 0) & (row < rows - 1) & (column >= 0) & (column < columns - 1)
     column, row = jnp.clip(column, 0, columns - 2), jnp.clip(row, 0, rows - 2)
@@ -127,8 +127,55 @@ def fit(
     return Fit(stack_scalars(hessian), slope, residual, used, share)
 
 
-def _placed(pose: jax.Array, points: Points) -> tuple[jax.Array, ...]:
-    """Points and normals in the map's frame, and from the robot to each point, still in that frame: (B,) each."""
+def overlap(
+    lines: jax.Array,
+    position: jax.Array,
+    turned: Placed,
+    scale: jax.Array,
+    *,
+    spec: GridSpec,
+    at: int | jax.Array = 0,
+) -> jax.Array:
+    """How many points lie on lines of the map, each by its weight, read from the nearest cell alone.
+
+    Args:
+        lines, scale, spec, at: as of `fit`.
+        position: (2,) m, of the robot.
+        turned: the points of the scan as `placed` at the origin, with the robot's heading.
+
+    Returns:
+        () between 0 and the number of points.
+    """
+    rows, columns = spec.shape
+    corners = _in_cells(
+        position[0] + turned.x + spec.resolution / 2, position[1] + turned.y + spec.resolution / 2, spec
+    )
+    (column, u), (row, v) = corners
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    index = (jnp.clip(row, 0, rows - 1) + at * rows) * columns + jnp.clip(column, 0, columns - 1)
+    xx, xy, yy, b_x, b_y, weight = jnp.moveaxis(lines.reshape(-1, SUMS).at[index].get(mode="promise_in_bounds"), -1, 0)
+    dx, dy, n_x, n_y = (u - 0.5) * spec.resolution, (v - 0.5) * spec.resolution, turned.normal_x, turned.normal_y
+    agree = n_x * n_x * xx + 2 * n_x * n_y * xy + n_y * n_y * yy
+    known = turned.valid & inside & (weight > _LEAST_WEIGHT) & (agree > _LEAST_AGREEMENT * weight)
+    off = n_x * (xx * dx + xy * dy - b_x) + n_y * (xy * dx + yy * dy - b_y)
+    residual = off / jnp.where(known, agree, 1)
+    return jnp.sum(jnp.where(known, agree / jnp.where(known, weight, 1) / (1 + (residual / scale) ** 2), 0))
+
+
+class Placed(NamedTuple):
+    """Points of a scan in the map's frame, (B,) each."""
+
+    x: jax.Array  # m
+    y: jax.Array
+    normal_x: jax.Array
+    normal_y: jax.Array
+    arm_x: jax.Array  # m, from the robot to the point, in the map's frame
+    arm_y: jax.Array
+    valid: jax.Array  # bool
+
+
+def placed(pose: jax.Array, points: Points) -> Placed:
+    """The points of a scan taken at a pose (3,)."""
     sin, cos = sin_cos(pose[2])
 
     def turned(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -136,7 +183,7 @@ def _placed(pose: jax.Array, points: Points) -> tuple[jax.Array, ...]:
         return cos * x - sin * y, sin * x + cos * y
 
     arm_x, arm_y = turned(points.xy)
-    return pose[0] + arm_x, pose[1] + arm_y, *turned(points.normal), arm_x, arm_y
+    return Placed(pose[0] + arm_x, pose[1] + arm_y, *turned(points.normal), arm_x, arm_y, points.valid)
 
 
 def _in_cells(x: jax.Array, y: jax.Array, spec: GridSpec) -> list[tuple[jax.Array, jax.Array]]:

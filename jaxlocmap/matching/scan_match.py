@@ -14,7 +14,9 @@ from jaxlocmap.matching.normals import Points
 from jaxlocmap.se2 import POSE, boxminus
 from jaxlocmap.types import GridSpec
 
+_CONVERGED = 0.1  # squared length of a step, by the information of the scan, below which no more are needed
 _SEARCH_POINTS = 60  # of a scan, evenly spread, that a search over a window looks at
+_SEARCHED = (9, 9, 13)  # poses of a search: along x, y, and headings
 
 
 class Match(NamedTuple):
@@ -23,6 +25,7 @@ class Match(NamedTuple):
     pose: jax.Array  # (3,) m, m, rad: the most probable one, given the scan and the belief before
     information: jax.Array  # (3, 3) 1/m^2, 1/m^2, 1/rad^2 on the diagonal: of the scan alone, not of the belief
     score: jax.Array  # (3,) 1/m, 1/m, 1/rad: derivative of the scan's log density there; the belief's is its opposite
+    converged: jax.Array  # () bool: one more step would change little
     points: jax.Array  # () int32, points of the scan that have a normal
     used: jax.Array  # () int32, those of them that lie on a line of the map
 
@@ -62,19 +65,73 @@ def match(
     checks.shapes(mean=(mean, (POSE,)), cov=(cov, (POSE, POSE)), std=(std, ()))
     P, information = Matrix.symmetric(cov), 1 / std**2
 
-    def step(pose: jax.Array, _: None) -> tuple[jax.Array, None]:
+    def fit(pose: jax.Array) -> tuple[line_grid.Fit, jax.Array]:
+        """How the scan fits at a pose, and the step from there."""
         found = line_grid.fit(lines, pose, points, scale, spec=spec, at=at)
         back = boxminus(pose, mean)
         gain = inverse(Matrix.identity(POSE) + P @ Matrix.symmetric(found.hessian * information))
         pull = P @ Matrix([[x * information] for x in found.slope]) + Matrix([[x] for x in back])
-        return pose - stack_scalars([x for (x,) in (gain @ pull).rows]), None
+        return found, -stack_scalars([x for (x,) in (gain @ pull).rows])
 
-    pose, _ = jax.lax.scan(step, mean if start is None else start, length=steps)
-    found = line_grid.fit(lines, pose, points, scale, spec=spec, at=at)
+    pose, _ = jax.lax.scan(lambda pose, _: (pose + fit(pose)[1], None), mean if start is None else start, length=steps)
+    found, left = fit(pose)
+    Lambda = found.hessian * information
     return Match(
         pose=pose,
-        information=found.hessian * information,
+        information=Lambda,
         score=-found.slope * information,
+        converged=left @ Lambda @ left < _CONVERGED,
         points=jnp.sum(points.valid, dtype=jnp.int32),
         used=jnp.sum(found.used, dtype=jnp.int32),
     )
+
+
+def search(
+    lines: jax.Array,
+    mean: jax.Array,
+    cov: jax.Array,
+    points: Points,
+    scale: jax.Array,
+    *,
+    spec: GridSpec,
+    window: tuple[float, float],
+    at: int | jax.Array = 0,
+) -> jax.Array:
+    """Where to begin a match that may be farther off than `lines.REACH`: the best of many poses about the mean.
+
+    A pose's score is twice the number of points that lie on lines there, each by its weight in `lines.fit` but read
+    from the nearest cell alone, less half the squared distance from the mean in standard deviations. The poses reach
+    three of these to either side, or as far as the window.
+
+    Args:
+        lines, mean, cov, points, scale, spec, at: as of `match`.
+        window: m, rad: how far to either side at most, static.
+
+    Returns:
+        (3,), of derivative zero. Source: Olson 2009 (correlative matching).
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shapes(mean=(mean, (POSE,)), cov=(cov, (POSE, POSE)), scale=(scale, ()))
+    every = -(-len(points.xy) // _SEARCH_POINTS)
+    points = jax.tree.map(lambda x: x[::every], points)
+    sigma = jnp.sqrt(jnp.maximum(jnp.diagonal(cov), jnp.finfo(cov.dtype).tiny))
+    reach = jnp.minimum(3 * sigma, jnp.asarray((window[0], window[0], window[1]), cov.dtype))
+    steps = [jnp.linspace(-1, 1, count, dtype=cov.dtype) * reach[i] for i, count in enumerate(_SEARCHED)]
+    shifts = jnp.stack([shift.ravel() for shift in jnp.meshgrid(steps[0], steps[1], indexing="ij")], axis=-1)
+
+    def turned(turn: jax.Array) -> jax.Array:
+        """The score of every shift at one heading."""
+        heading = jnp.zeros(POSE, mean.dtype).at[2].set(mean[2] + turn)
+        placed = line_grid.placed(heading, points)
+        score = jax.vmap(lambda shift: line_grid.overlap(lines, mean[:2] + shift, placed, scale, spec=spec, at=at))(
+            shifts
+        )
+        away = jnp.sum((shifts / sigma[None, :2]) ** 2, axis=-1) + (turn / sigma[2]) ** 2
+        return 2 * score - away / 2
+
+    scores = jax.lax.map(turned, steps[2])
+    best = jnp.argmax(scores.ravel())
+    shift, turn = shifts[best % len(shifts)], steps[2][best // len(shifts)]
+    return jax.lax.stop_gradient(mean + jnp.concatenate([shift, turn[None]]))

@@ -21,7 +21,7 @@ from jaxlocmap._internal.linalg import Matrix, inverse, mirrored
 from jaxlocmap.filters import ekf, information
 from jaxlocmap.matching import lines as line_grid
 from jaxlocmap.matching.normals import surface_points
-from jaxlocmap.matching.scan_match import match
+from jaxlocmap.matching.scan_match import match, search
 from jaxlocmap.parameters import Block, Params
 from jaxlocmap.se2 import POSE, between, boxminus, wrap
 from jaxlocmap.types import Gaussian, Matcher, Scanner
@@ -56,6 +56,7 @@ class MatchReport(NamedTuple):
     displacement: jax.Array  # (3,) m, m, rad: the pose matched, in the submap's frame, minus the pose predicted
     information: jax.Array  # (3, 3) of the scan alone
     nis: jax.Array  # () squared Mahalanobis distance of the displacement by the predicted covariance
+    converged: jax.Array  # () bool: the steps of Gauss-Newton sufficed
     points: jax.Array  # () int32: points of the scan that have a normal
     used: jax.Array  # () int32: those that lie on lines of the submap
     accepted: jax.Array  # () bool
@@ -94,7 +95,7 @@ def no_match(dtype: np.dtype) -> MatchReport:
     none, real = jnp.zeros((), jnp.int32), jnp.zeros((), dtype)
     vector, square, false = jnp.zeros(POSE, dtype), jnp.zeros((POSE, POSE), dtype), jnp.zeros((), bool)
     pose = Gaussian(vector, square)
-    return MatchReport(false, vector, square, real, none, none, false, none, pose, false, false, false, pose)
+    return MatchReport(false, vector, square, real, false, none, none, false, none, pose, false, false, false, pose)
 
 
 def extended(belief: Gaussian) -> Gaussian:
@@ -163,16 +164,17 @@ def match_scan(
     number = submaps.begun - 1 - (submaps.scans[1] > 0).astype(jnp.int32)
     predicted, H = relative_pose(belief.mean, older)
     rel = H @ belief.cov @ H.T
-    found = match(
-        submaps.lines, predicted, rel, points, std, scale, spec=matcher.spec, steps=matcher.steps, at=submaps.older
-    )
+    where = {"spec": matcher.spec, "at": submaps.older}
+    start = None
+    if matcher.window is not None:
+        start = search(submaps.lines, predicted, rel, points, scale, window=matcher.window, **where)
+    found = match(submaps.lines, predicted, rel, points, std, scale, steps=matcher.steps, start=start, **where)
     moved = boxminus(found.pose, predicted)
     nis = moved @ found.score
     tried = usable & (submaps.scans[0] > 0)
     gate = ekf.gate_threshold(matcher.gate_probability, POSE)
-    accepted = (
-        tried & (nis < gate) & (found.used.astype(nis.dtype) >= matcher.least_share * found.points.astype(nis.dtype))
-    )
+    enough = found.used.astype(nis.dtype) >= matcher.least_share * found.points.astype(nis.dtype)
+    accepted = tried & found.converged & (nis < gate) & enough
     gradient = found.information @ moved + found.score
     poses = (0, older, younger)
     corrected = information.update(*belief, H, found.information, gradient, angles=angles, poses=poses)
@@ -228,6 +230,7 @@ def match_scan(
         displacement=jnp.where(tried, moved, 0),
         information=jnp.where(tried, found.information, 0),
         nis=jnp.where(tried, nis, 0),
+        converged=tried & found.converged,
         points=found.points,
         used=jnp.where(tried, found.used, 0),
         accepted=accepted,
