@@ -120,7 +120,8 @@ def fit(
     residual = (normal_x * off_x + normal_y * off_y) / jnp.where(known, agree, 1)
     used = known & (jnp.abs(residual) < REACH)
     residual = jnp.where(used, residual, 0)
-    share = jnp.where(used, agree / jnp.where(used, weight, 1) / (1 + (residual / scale) ** 2), 0)
+    robust = (1 - (residual / REACH) ** 2) / (1 + (residual / scale) ** 2)
+    share = jnp.where(used, agree / jnp.where(used, weight, 1) * robust, 0)
     J = normal_x, normal_y, normal_y * arm_x - normal_x * arm_y
     hessian = [[jnp.sum(share * J[min(i, j)] * J[max(i, j)]) for j in range(POSE)] for i in range(POSE)]
     slope = jnp.stack([jnp.sum(share * Ji * residual) for Ji in J])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ from jaxlocmap.types import GridSpec
 
 _CONVERGED = 0.1  # squared length of a step, by the information of the scan, below which no more are needed
 _SEARCH_POINTS = 60  # of a scan, evenly spread, that a search over a window looks at
-_SEARCHED = (9, 9, 13)  # poses of a search: along x, y, and headings
+_SEARCH_STEPS = (0.1, 0.1, 0.05)  # m, m, rad: between the poses it looks at, at most
 
 
 class Match(NamedTuple):
@@ -117,8 +118,10 @@ def search(
     every = -(-len(points.xy) // _SEARCH_POINTS)
     points = jax.tree.map(lambda x: x[::every], points)
     sigma = jnp.sqrt(jnp.maximum(jnp.diagonal(cov), jnp.finfo(cov.dtype).tiny))
-    reach = jnp.minimum(3 * sigma, jnp.asarray((window[0], window[0], window[1]), cov.dtype))
-    steps = [jnp.linspace(-1, 1, count, dtype=cov.dtype) * reach[i] for i, count in enumerate(_SEARCHED)]
+    widest = (window[0], window[0], window[1])
+    reach = jnp.minimum(3 * sigma, jnp.asarray(widest, cov.dtype))
+    counts = [2 * math.ceil(width / step - 1e-9) + 1 for width, step in zip(widest, _SEARCH_STEPS, strict=True)]
+    steps = [jnp.linspace(-1, 1, count, dtype=cov.dtype) * reach[i] for i, count in enumerate(counts)]
     shifts = jnp.stack([shift.ravel() for shift in jnp.meshgrid(steps[0], steps[1], indexing="ij")], axis=-1)
 
     def turned(turn: jax.Array) -> jax.Array:
