@@ -208,7 +208,8 @@ def match_scan(
     scans = jnp.where(anew, 0, scans)
     lines = submaps.lines.reshape(2, -1)
     for cleared, slot in ((due, 1 - which), (anew, which)):
-        lines = lines.at[jnp.where(cleared, slot, 2)].set(0, mode="drop")
+        # That the index is unique, as one alone is, makes the derivative a plain copy.
+        lines = lines.at[jnp.where(cleared, slot, 2)].set(0, mode="drop", unique_indices=True)
     lines = lines.reshape(submaps.lines.shape)
 
     # Add the scan to both.
