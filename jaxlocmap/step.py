@@ -114,6 +114,7 @@ def match(
             scanner=config.scanner(beam_angles),
             matcher=matcher,
             angles=state_angles(config),
+            temperature=config.gate_temperature,
         )
 
     def not_now(belief: Gaussian, submaps: matching.Submaps) -> Any:

@@ -74,7 +74,7 @@ class Config:
     dt: float = 0.1  # s, > 0: the period that Q refers to
     motion: Any = "arc"  # "euler" | "arc" | "capstone" | motion.MotionModel
     gate_probability: float | None = 0.99  # in (0, 1): share of good observations let in; None: no gate
-    gate_temperature: float = 0.0  # >= 0, of the squared distance: 0 decides, more weighs (`ekf.update`)
+    gate_temperature: float = 0.0  # >= 0, of the squared distance: 0 decides, more weighs (`ekf.gate_weight`)
     sensor_offset: Offset = (0.0, 0.0, 0.0)  # m, m, rad: where the sensor sits in the body frame
     grid: GridSpec | None = None  # None: localisation alone
     min_range: float = 0.05  # m: a range of the scanner at or below is no measurement
@@ -127,6 +127,7 @@ class Matcher:
     submap_length: float = 4.0  # m of travel, > 0, a turn of a radian counted as half a metre: or after that
     resolution: float = 0.1  # m per cell, > 0
     half_width: float = 12.0  # m of a submap about its anchor: the reach of a scan and some travel; > resolution
+    range_std: float = 0.03  # m, > 0, of a range: points farther off a surface have no normal (`surface_points`)
     gap: float = 0.5  # m, > 0: ends of neighbouring beams farther apart than this lie on two surfaces
     steps: int = 10  # of Gauss-Newton; >= 1
     window: tuple[float, float] | None = None  # m, rad, > 0: how far to search before; None: not
@@ -150,7 +151,7 @@ class Matcher:
         for name in ("gate_probability", "least_share"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"Matcher.{name}: expected a value inside (0, 1), got {getattr(self, name)}")
-        for name in ("resolution", "gap", "submap_length", "half_width"):
+        for name in ("resolution", "range_std", "gap", "submap_length", "half_width"):
             least = self.resolution if name == "half_width" else 0
             if not least < getattr(self, name) < math.inf:
                 raise ValueError(f"Matcher.{name}: expected finite metres > {least}, got {getattr(self, name)}")

@@ -56,6 +56,19 @@ def gate_threshold(probability: float | jax.Array | None, dimension: int) -> Any
     return float(2 * scipy.special.gammaincinv(dimension / 2, probability))
 
 
+def gate_weight(nis: jax.Array, threshold: float | jax.Array, temperature: float) -> jax.Array:
+    """Weight of an observation at a gate that weighs instead of deciding.
+
+        w = 1 / (1 + exp((d² - threshold) / temperature)),  but at least one in a million
+
+    Args:
+        nis: () d², its squared Mahalanobis distance.
+        threshold: of d², from `gate_threshold`.
+        temperature: > 0, of d²: how wide the gate is.
+    """
+    return jnp.maximum(jax.nn.sigmoid((threshold - nis) / temperature), _LEAST_WEIGHT)
+
+
 def _chi2_quantile(probability: jax.Array, dimension: int) -> jax.Array:
     """As `chi2.ppf`, which `jax.scipy` lacks."""
     if dimension == 2:
@@ -151,8 +164,8 @@ def update(
         R: (m, m) covariance of the observation.
         threshold: gate on d², from `gate_threshold(probability, m)`; no gate by default.
         temperature: 0 for a gate that decides. Otherwise, in units of d², one that weighs: every observation corrects
-            the belief, with R / w in the place of R, w = 1 / (1 + exp((d² - threshold) / temperature)). Near the
-            threshold the correction then changes smoothly, so that derivatives tell what the gate does.
+            the belief, with R / w in the place of R, w its `gate_weight`. Near the threshold the correction then
+            changes smoothly, so that derivatives tell what the gate does.
         valid: () bool; False leaves the belief as it is.
         angles: entries of the state that are angles, static.
 
@@ -182,7 +195,7 @@ def update(
     nis = reported.nis
     accepted = applied = jnp.logical_and(nis < threshold, valid)  # what is no number is not below, gate or none
     if temperature and not (isinstance(threshold, float) and math.isinf(threshold)):
-        weight = jnp.maximum(jax.nn.sigmoid((threshold - nis) / temperature), _LEAST_WEIGHT)
+        weight = gate_weight(nis, threshold, temperature)
         corrected, applied = correct(noise.scale(1 / weight)), jnp.logical_and(jnp.isfinite(nis), valid)
 
     def chosen(new: Any, old: Any) -> list[jax.Array]:

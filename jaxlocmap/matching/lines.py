@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxlocmap import checks
 from jaxlocmap._internal.linalg import stack_scalars
@@ -63,18 +64,19 @@ def add_points(
     rows, columns = _check(lines, pose, points, spec)
     x, y, normal_x, normal_y, *_ = placed(pose, points)
     (column, u), (row, v) = _in_cells(x, y, spec)
-    index, sums = [], []
-    for i in (-1, 0, 1, 2):
-        for j in (-1, 0, 1, 2):
-            du, dv = u - j, v - i
-            inside = (row + i >= 0) & (row + i < rows) & (column + j >= 0) & (column + j < columns)
-            w = jnp.where(points.valid & inside & counts, (1 - jnp.abs(du) / 2) * (1 - jnp.abs(dv) / 2), 0)
-            off = (normal_x * du + normal_y * dv) * spec.resolution
-            n = (normal_x * normal_x, normal_x * normal_y, normal_y * normal_y, normal_x * off, normal_y * off)
-            sums.append(jnp.stack([*(w * term for term in n), w], axis=-1))
-            index.append((jnp.clip(row + i, 0, rows - 1) + at * rows) * columns + jnp.clip(column + j, 0, columns - 1))
+    # The cells two to either side at once, (16, B): cell by cell they would take long to compile.
+    i, j = np.indices((4, 4)).reshape(2, -1, 1) - 1
+    du, dv = u[None] - jnp.asarray(j, u.dtype), v[None] - jnp.asarray(i, v.dtype)
+    row, column = row[None] + jnp.asarray(i, row.dtype), column[None] + jnp.asarray(j, column.dtype)
+    inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+    w = jnp.where(points.valid[None] & inside & counts, (1 - jnp.abs(du) / 2) * (1 - jnp.abs(dv) / 2), 0)
+    normal_x, normal_y = normal_x[None], normal_y[None]
+    off = (normal_x * du + normal_y * dv) * spec.resolution
+    n = (normal_x * normal_x, normal_x * normal_y, normal_y * normal_y, normal_x * off, normal_y * off)
+    sums = jnp.stack([*(w * term for term in n), w], axis=-1)
+    index = (jnp.clip(row, 0, rows - 1) + at * rows) * columns + jnp.clip(column, 0, columns - 1)
     flat = lines.reshape(-1, SUMS)
-    flat = flat.at[jnp.concatenate(index)].add(jnp.concatenate(sums), mode="promise_in_bounds")
+    flat = flat.at[index].add(sums, mode="promise_in_bounds")
     return flat.reshape(lines.shape)
 
 

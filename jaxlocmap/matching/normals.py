@@ -23,7 +23,7 @@ class Points(NamedTuple):
     valid: jax.Array  # (B,) bool: the beam hit something, and what it hit has a normal
 
 
-def surface_points(ranges: jax.Array, std: jax.Array, *, scanner: Scanner, gap: float) -> Points:
+def surface_points(ranges: jax.Array, std: jax.Array | float, *, scanner: Scanner, gap: float) -> Points:
     """The points of a scan and the normals of the surfaces they lie on, from a line fitted to each point and its
     neighbours by principal axes.
 

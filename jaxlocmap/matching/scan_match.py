@@ -52,6 +52,10 @@ def match(
     Nothing is inverted that may be singular: neither P, which is zero where the pose is known, nor Λ, which is singular
     in a corridor. There the pose stays along the corridor where the belief has it.
 
+    Derivatives go forward through the steps. They are those of what is computed, of any order, which standard errors
+    need. The implicit derivative at the optimum takes a little less time, but it is that of steps that have converged
+    to the last digit, and its second one is another.
+
     Args:
         lines, points, scale, spec, at: as of `lines.fit`.
         mean: (3,) m, m, rad, the pose in the map's frame that is believed.

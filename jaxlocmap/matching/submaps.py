@@ -139,6 +139,7 @@ def match_scan(
     scanner: Scanner,
     matcher: Matcher,
     angles: tuple[int, ...],
+    temperature: float = 0.0,
 ) -> tuple[Gaussian, Submaps, MatchReport]:
     """Match a scan on the older submap, correct the belief, and add the scan to both submaps.
 
@@ -150,6 +151,9 @@ def match_scan(
         scanner: with B beams.
         matcher: static.
         angles: entries of the whole state that are angles, static.
+        temperature: 0 for a gate that decides. Otherwise, in units of the squared distance, one that weighs
+            (`ekf.gate_weight`): a match corrects the belief with its log density times its weight. What is added to the
+            map is decided all the same.
 
     Raises:
         ValueError: a wrong shape, or a block that `params` lacks.
@@ -157,7 +161,8 @@ def match_scan(
     std, scale, length = (params.block(block) for block in BLOCKS)
     older = len(belief.mean) - EXTRA
     younger = older + 2 * POSE
-    points = surface_points(ranges, std, scanner=scanner, gap=matcher.gap)
+    # Which points have a normal must not hang on what is tuned: the loss would jump with every point.
+    points = surface_points(ranges, matcher.range_std, scanner=scanner, gap=matcher.gap)
     usable = jnp.sum(points.valid, dtype=jnp.int32) >= matcher.least_points
 
     # Match on the older submap.
@@ -174,11 +179,15 @@ def match_scan(
     tried = usable & (submaps.scans[0] > 0)
     gate = ekf.gate_threshold(matcher.gate_probability, POSE)
     enough = found.used.astype(nis.dtype) >= matcher.least_share * found.points.astype(nis.dtype)
-    accepted = tried & found.converged & (nis < gate) & enough
-    gradient = found.information @ moved + found.score
+    sound = tried & found.converged & enough
+    applied = accepted = sound & (nis < gate)
+    told, gradient = found.information, found.information @ moved + found.score
+    if temperature:
+        weight = ekf.gate_weight(nis, gate, temperature)
+        applied, told, gradient = sound & jnp.isfinite(nis), weight * told, weight * gradient
     poses = (0, older, younger)
-    corrected = information.update(*belief, H, found.information, gradient, angles=angles, poses=poses)
-    belief = _chosen(accepted, Gaussian(*corrected), belief)
+    corrected = information.update(*belief, H, told, gradient, angles=angles, poses=poses)
+    belief = _chosen(applied, Gaussian(*corrected), belief)
     refused = jnp.where(accepted, 0, submaps.refused + tried.astype(jnp.int32))
 
     relative = _between(belief, older, 0)
@@ -199,7 +208,8 @@ def match_scan(
     scans = jnp.where(anew, 0, scans)
     lines = submaps.lines.reshape(2, -1)
     for cleared, slot in ((due, 1 - which), (anew, which)):
-        lines = lines.at[jnp.where(cleared, slot, 2)].set(0, mode="drop")
+        # That the index is unique, as one alone is, makes the derivative a plain copy.
+        lines = lines.at[jnp.where(cleared, slot, 2)].set(0, mode="drop", unique_indices=True)
     lines = lines.reshape(submaps.lines.shape)
 
     # Add the scan to both.

@@ -27,7 +27,7 @@ class Judged(NamedTuple):
 
 
 def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[[Info, Judged], Any]) -> Any:
-    """The filter over every sequence, without mapping.
+    """The filter over every sequence, matching scans where it has a matcher, without an occupancy grid.
 
     Args:
         params: the filter's.
@@ -39,10 +39,14 @@ def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[
         What `collect` made of each step, leading axes (N, T).
 
     Raises:
-        ValueError, TypeError: as `pipeline.run`; fields of the batch that do not fit.
+        ValueError, TypeError: as `pipeline.run`; fields of the batch that do not fit; a matcher and no scans.
     """
     check_batch(batch)
-    config = dataclasses.replace(config, grid=None)
+    config, inputs, beam_angles = dataclasses.replace(config, grid=None), batch.inputs, batch.beam_angles
+    if config.matcher is None:
+        inputs, beam_angles = inputs._replace(ranges=None), None
+    elif inputs.ranges is None or beam_angles is None:
+        raise ValueError("config.matcher: expected batch.inputs.ranges and batch.beam_angles to match, got None")
     dtype, dim = jnp.asarray(batch.prior.mean).dtype, motion.resolve(config.motion).dim
     params, landmarks, truth = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, batch.landmarks, batch.truth))
 
@@ -53,6 +57,7 @@ def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[
             state,
             inputs,
             landmarks=landmarks,
+            beam_angles=beam_angles,
             config=config,
             collect=lambda state, info, aside: collect(info, aside),
             aside=judged,
@@ -60,7 +65,7 @@ def filtered(params: Params, batch: Batch, *, config: Config, collect: Callable[
         return collected
 
     judged = Judged(jnp.asarray(batch.counted), truth, batch.known)
-    return jax.vmap(one)(batch.prior, batch.inputs._replace(ranges=None), judged)
+    return jax.vmap(one)(batch.prior, inputs, judged)
 
 
 def beliefs(params: Params, batch: Batch, *, config: Config) -> Gaussian:

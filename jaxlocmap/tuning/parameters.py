@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks, motion, sensors
+from jaxlocmap.matching import submaps
 from jaxlocmap.parameters import L_FREE, L_OCC, Block, Params, Q, R
 from jaxlocmap.types import Config
 
@@ -19,9 +20,9 @@ BLOCKS = (Q, R, *_INVERSE_SENSOR_MODEL)
 
 
 def blocks_of(config: Config) -> tuple[Block, ...]:
-    """The blocks that a filter with these settings has: of its motion model, its sensor and its map."""
+    """The blocks that a filter with these settings has: of its motion model, its sensor, its matcher and its map."""
     own = (*motion.resolve(config.motion).noise, sensors.resolve(config.sensor).noise)
-    return (*own, *_INVERSE_SENSOR_MODEL)
+    return (*own, *(() if config.matcher is None else submaps.BLOCKS), *_INVERSE_SENSOR_MODEL)
 
 
 def names_of(blocks: tuple[Block, ...]) -> tuple[str, ...]:
