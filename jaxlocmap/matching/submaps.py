@@ -52,7 +52,8 @@ class Submaps(NamedTuple):
 class MatchReport(NamedTuple):
     """What a step reports of matching. All zero where none was due."""
 
-    tried: jax.Array  # () bool: a scan was there and a submap to match it on
+    due: jax.Array  # () bool: a scan was to be matched, whatever it saw
+    tried: jax.Array  # () bool: it had points enough, and there was a submap to match it on
     displacement: jax.Array  # (3,) m, m, rad: the pose matched, in the submap's frame, minus the pose predicted
     information: jax.Array  # (3, 3) of the scan alone
     nis: jax.Array  # () squared Mahalanobis distance of the displacement by the predicted covariance
@@ -66,6 +67,15 @@ class MatchReport(NamedTuple):
     anew: jax.Array  # () bool: an older one does: the first of all, or after too many refusals
     finished: jax.Array  # () bool: the older one is finished, and the younger takes its place
     edge: Gaussian  # (3,), (3, 3) m, m, rad: then the younger one's anchor in the frame of the older one's
+
+
+class Refusals(NamedTuple):
+    """Why a match was refused. Several reasons may hold at once."""
+
+    points: jax.Array  # () bool: the scan has fewer points with a normal than `Matcher.least_points`
+    share: jax.Array  # () bool: a smaller share of them lies on lines of the submap than `Matcher.least_share`
+    nis: jax.Array  # () bool: the gate of `Matcher.gate_probability` refuses its squared Mahalanobis distance
+    convergence: jax.Array  # () bool: `Matcher.steps` of Gauss-Newton did not suffice
 
 
 def with_defaults(params: Params, *, std: float = 0.03, scale: float = 0.1, length: float = 0.6) -> Params:
@@ -95,7 +105,9 @@ def no_match(dtype: np.dtype) -> MatchReport:
     none, real = jnp.zeros((), jnp.int32), jnp.zeros((), dtype)
     vector, square, false = jnp.zeros(POSE, dtype), jnp.zeros((POSE, POSE), dtype), jnp.zeros((), bool)
     pose = Gaussian(vector, square)
-    return MatchReport(false, vector, square, real, false, none, none, false, none, pose, false, false, false, pose)
+    return MatchReport(
+        *(false, false, vector, square, real, false, none, none, false, none, pose, false, false, false, pose)
+    )
 
 
 def extended(belief: Gaussian) -> Gaussian:
@@ -136,6 +148,7 @@ def match_scan(
     submaps: Submaps,
     ranges: jax.Array,
     *,
+    before: jax.Array,
     scanner: Scanner,
     matcher: Matcher,
     angles: tuple[int, ...],
@@ -147,6 +160,7 @@ def match_scan(
         belief: (n + 12,), predicted to the time of the scan.
         submaps: so far.
         ranges: (B,) m.
+        before: (n + 12,) mean after the step before, corrected: the odometry may tell of no travel, or of too much.
         scanner: with B beams.
         matcher: static.
         angles: entries of the whole state that are angles, static.
@@ -172,14 +186,24 @@ def match_scan(
     moved = boxminus(found.pose, predicted)
     nis = moved @ found.score
     tried = usable & (submaps.scans[0] > 0)
-    gate = ekf.gate_threshold(matcher.gate_probability, POSE)
-    enough = found.used.astype(nis.dtype) >= matcher.least_share * found.points.astype(nis.dtype)
-    accepted = tried & found.converged & (nis < gate) & enough
+    report = no_match(nis.dtype)._replace(
+        due=jnp.ones((), bool),
+        tried=tried,
+        displacement=jnp.where(tried, moved, 0),
+        information=jnp.where(tried, found.information, 0),
+        nis=jnp.where(tried, nis, 0),
+        converged=tried & found.converged,
+        points=found.points,
+        used=jnp.where(tried, found.used, 0),
+    )
+    accepted = tried & ~jnp.any(jnp.stack(refusals(report, matcher)))
     gradient = found.information @ moved + found.score
     poses = (0, older, younger)
     corrected = information.update(*belief, H, found.information, gradient, angles=angles, poses=poses)
     belief = _chosen(accepted, Gaussian(*corrected), belief)
     refused = jnp.where(accepted, 0, submaps.refused + tried.astype(jnp.int32))
+
+    submaps = travelled(submaps, before, belief.mean)
 
     relative = _between(belief, older, 0)
 
@@ -225,14 +249,7 @@ def match_scan(
         refused=jnp.where(anew, 0, refused),
         begun=submaps.begun + (due | anew).astype(jnp.int32),
     )
-    report = MatchReport(
-        tried=tried,
-        displacement=jnp.where(tried, moved, 0),
-        information=jnp.where(tried, found.information, 0),
-        nis=jnp.where(tried, nis, 0),
-        converged=tried & found.converged,
-        points=found.points,
-        used=jnp.where(tried, found.used, 0),
+    report = report._replace(
         accepted=accepted,
         submap=number,
         relative=Gaussian(*(jnp.where(tried, x, 0) for x in relative)),
@@ -242,6 +259,22 @@ def match_scan(
         edge=Gaussian(*(jnp.where(finished, x, 0) for x in edge)),
     )
     return belief, submaps, report
+
+
+def refusals(report: MatchReport, matcher: Matcher) -> Refusals:
+    """Why the match of a step was refused: no reason holds where it was let in, or none was due.
+
+    Args:
+        report: of a step, or of many: any leading shape.
+        matcher: that made it.
+    """
+    dtype = report.nis.dtype
+    return Refusals(
+        points=report.due & (report.points < matcher.least_points),
+        share=report.tried & (report.used.astype(dtype) < matcher.least_share * report.points.astype(dtype)),
+        nis=report.tried & ~(report.nis < ekf.gate_threshold(matcher.gate_probability, POSE)),
+        convergence=report.tried & ~report.converged,
+    )
 
 
 def _chosen(new_if: jax.Array, new: Gaussian, old: Gaussian) -> Gaussian:
