@@ -71,7 +71,7 @@ def main(config: MapLogConfig) -> dict[str, Any]:
         f"{len(log.scan)} scans of {log.scan.shape[1]} beams onto {spec.shape[0]} x {spec.shape[1]} cells",
     )
     say_doubts(log, settings.max_range)
-    log_odds, seconds, compile_s = _map(params, mapped, settings)
+    log_odds, seconds, compile_s = make_map(params, mapped, settings)
     cells = save_map(out, log_odds, spec, name="map")
     report = {
         "log": log.name,
@@ -207,7 +207,7 @@ def extent(log: Log, resolution: float) -> GridSpec:
     )
 
 
-def _map(params: Params, log: Log, config: Config) -> tuple[np.ndarray, float, float]:
+def make_map(params: Params, log: Log, config: Config) -> tuple[np.ndarray, float, float]:
     """Log-odds, the seconds mapping took and the seconds compiling took."""
     scans, angles = len(log.scan), log.beam_angles.astype(np.float32)
     fill = -scans % _PIECE  # scans without a measurement change nothing

@@ -68,8 +68,10 @@ def innovation_rows(report: dict[str, Any]) -> Rows:
 
 def match_rows(report: dict[str, Any]) -> Rows:
     """Matches, and the poses that they tell: relative to a submap's anchor, and between anchors."""
+    refused = ", ".join(f"{report[f'match_refused_{why}']:,}" for why in ("points", "share", "nis", "convergence"))
     rows = [
         ("matches let in", f"{100 * report['match_accept_rate']:.2f} % of {report['matches']:,}", ""),
+        ("refused: few points, off the map, gate, not converged", refused, ""),
         ("NIS of a match", f"{report['match_nis_mean']:.3f}", "up to 3"),
         ("submaps begun anew", str(report["submaps_begun_anew"]), "0"),
     ]

@@ -127,7 +127,39 @@ theta + omega dt / 2, which needs no branch at omega = 0. Exact Jacobians. The d
 CAPSTONE = MotionModel(_arc_transition, _euler_jacobians)
 """The mean on the exact arc, the covariance with first-order Jacobians: a common mixture, kept for comparison."""
 
-MODELS = {"euler": EULER, "arc": ARC, "capstone": CAPSTONE}
+ODOMETRY_NOISE = Block("odometry", ("x", "y", "theta"), ("m", "m", "rad"))  # that builds up over a metre of travel
+_TURN, _LEAST = 0.5, 0.05  # m a radian, m: what a turn counts beside travel, and a step at least
+
+
+def _odometry_path(control: jax.Array) -> jax.Array:
+    """m, square root of what the noise grows with."""
+    return (control[0] ** 2 + control[1] ** 2 + (_TURN * control[2]) ** 2 + _LEAST**2) ** 0.25
+
+
+def _check_odometry(pose: jax.Array, control: jax.Array, dt: jax.Array) -> None:
+    checks.shapes(pose=(pose, (3,)), control=(control, (3,)), dt=(dt, ()))
+
+
+def _odometry_transition(pose: jax.Array, control: jax.Array, dt: jax.Array) -> jax.Array:
+    _check_odometry(pose, control, dt)
+    sin, cos = sin_cos(pose[2])
+    return _moved(pose, cos * control[0] - sin * control[1], sin * control[0] + cos * control[1], wrap(control[2]))
+
+
+def _odometry_jacobians(pose: jax.Array, control: jax.Array, dt: jax.Array) -> tuple[Matrix, Matrix]:
+    _check_odometry(pose, control, dt)
+    s, c = sin_cos(pose[2])
+    F = Matrix([[1, 0, -s * control[0] - c * control[1]], [0, 1, c * control[0] - s * control[1]], [0, 0, 1]])
+    k = _odometry_path(control)
+    return F, Matrix([[k * c, -k * s, 0], [k * s, k * c, 0], [0, 0, k]])
+
+
+ODOMETRY = MotionModel(_odometry_transition, _odometry_jacobians, noise=(ODOMETRY_NOISE,))
+"""What the wheels say between two steps: the control is the displacement (dx, dy, dtheta) in the frame of the pose
+before, and its variance grows with the way, √(dx² + dy² + (0.5 m dtheta)²), at least 5 cm. Time plays no part: let
+every step last a nominal period. After Thrun, Burgard & Fox 2005, section 5.4."""
+
+MODELS = {"euler": EULER, "arc": ARC, "capstone": CAPSTONE, "odometry": ODOMETRY}
 
 
 def from_transition(

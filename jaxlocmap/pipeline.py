@@ -61,7 +61,7 @@ def init(prior: Gaussian, *, config: Config) -> State:
         checks.resolved("config.grid", grid.corners(config.grid), mean.dtype)
     belief = Gaussian(mean, cov.astype(mean.dtype))
     return State(
-        belief=belief if config.matcher is None else submaps.extended(belief),
+        belief=belief if config.matcher is None else submaps.extended(belief, config.matcher),
         log_odds=None if config.grid is None else jnp.zeros(config.grid.shape, mean.dtype),
         log_likelihood=jnp.zeros((), mean.dtype),
         submaps=None if config.matcher is None else submaps.empty(config.matcher, mean.dtype),
@@ -301,9 +301,11 @@ def _check_step(
         checks.resolved("landmarks", landmarks, state.belief.mean.dtype)
         if not len(landmarks):
             raise ValueError(f"landmarks: expected at least one for the {slots} observation slots, got (0, 2)")
-    if config.grid is not None and inputs.ranges is not None:
+    if config.matcher is not None and state.submaps is None:
+        raise ValueError("state.submaps: expected submaps, as init makes with this config, got None")
+    if (config.grid is not None or config.matcher is not None) and inputs.ranges is not None:
         if beam_angles is None:
-            raise ValueError("beam_angles: expected (B,) for the ranges to map, got None")
+            raise ValueError("beam_angles: expected (B,) for the ranges to map or to match, got None")
         checks.shape("beam_angles", beam_angles, (None,))
         checks.dtype("beam_angles", beam_angles, np.floating)
         checks.shape("inputs.ranges", inputs.ranges, np.shape(beam_angles))

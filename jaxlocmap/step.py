@@ -82,8 +82,9 @@ def turn(
     belief, log_odds, submaps, report = observed.belief, state.log_odds, state.submaps, None
     if ranges is not None and beam_angles is not None:
         if submaps is not None and config.matcher is not None:
-            submaps = matching.travelled(submaps, state.belief.mean, predicted.mean)
-            belief, submaps, report = match(params, belief, submaps, ranges, beam_angles, config=config)
+            belief, submaps, report = match(
+                params, belief, submaps, ranges, beam_angles, before=state.belief.mean, config=config
+            )
         if log_odds is not None:
             log_odds = map_scan(params, log_odds, belief.mean, ranges, beam_angles, config=config)
     ok = moved & observed.ok & is_valid(belief)
@@ -98,9 +99,10 @@ def match(
     ranges: jax.Array,
     beam_angles: jax.Array,
     *,
+    before: jax.Array,
     config: Config,
 ) -> tuple[Gaussian, matching.Submaps, matching.MatchReport]:
-    """The belief corrected by the scan, if one is due to be matched."""
+    """The belief corrected by the scan, if one is due to be matched. before: (n,) mean after the step before."""
     matcher = config.matcher
     if matcher is None:
         raise ValueError("config.matcher: expected the Matcher that the submaps were made for, got None")
@@ -111,6 +113,7 @@ def match(
             belief,
             submaps,
             ranges,
+            before=before,
             scanner=config.scanner(beam_angles),
             matcher=matcher,
             angles=state_angles(config),
@@ -118,7 +121,7 @@ def match(
         )
 
     def not_now(belief: Gaussian, submaps: matching.Submaps) -> Any:
-        return belief, submaps, matching.no_match(belief.mean.dtype)
+        return belief, matching.travelled(submaps, before, belief.mean), matching.no_match(belief.mean.dtype)
 
     due = any_in_batch(submaps.steps % matcher.period == 0)  # all runs of a batch are at the same step
     belief, submaps, report = cond(due, now, not_now, belief, submaps)

@@ -123,7 +123,7 @@ class Matcher:
     """
 
     period: int = 1  # steps between two matches, the first at step 0; >= 1
-    submap_scans: int = 10  # a new submap begins that often, and lives twice as long; >= 2
+    submap_scans: int | None = 10  # a new submap begins that often, and lives twice as long; >= 2; None: one map
     submap_length: float = 4.0  # m of travel, > 0, a turn of a radian counted as half a metre: or after that
     resolution: float = 0.1  # m per cell, > 0
     half_width: float = 12.0  # m of a submap about its anchor: the reach of a scan and some travel; > resolution
@@ -135,19 +135,22 @@ class Matcher:
     least_points: int = 10  # with a normal, that a scan must have; >= 1
     least_share: float = 0.2  # in (0, 1), of a scan's points that must lie on lines of the submap
     patience: int = 5  # matches refused in a row before the submaps are begun anew; >= 1
+    known_std: tuple[float, float] | None = None  # m, rad, > 0: errors of a known map, not to be changed; None: made
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            if field.name != "window":
+            if field.name not in ("window", "known_std") and getattr(self, field.name) is not None:
                 checks.number(field.name, getattr(self, field.name))
         for name, least in (("period", 1), ("submap_scans", 2), ("steps", 1), ("least_points", 1), ("patience", 1)):
             value = getattr(self, name)
-            if int(value) != value or value < least:
+            if value is not None and (int(value) != value or value < least):
                 raise ValueError(f"Matcher.{name}: expected a whole number of at least {least}, got {value}")
-        if self.window is not None:
-            freeze_tuples(self, "window")
-            if len(self.window) != 2 or not all(0 < reach < math.inf for reach in self.window):
-                raise ValueError(f"Matcher.window: expected two finite numbers > 0, m and rad, got {self.window}")
+        for name in ("window", "known_std"):
+            if getattr(self, name) is not None:
+                freeze_tuples(self, name)
+                pair = getattr(self, name)
+                if len(pair) != 2 or not all(0 < x < math.inf for x in pair):
+                    raise ValueError(f"Matcher.{name}: expected two finite numbers > 0, m and rad, got {pair}")
         for name in ("gate_probability", "least_share"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"Matcher.{name}: expected a value inside (0, 1), got {getattr(self, name)}")
@@ -155,6 +158,11 @@ class Matcher:
             least = self.resolution if name == "half_width" else 0
             if not least < getattr(self, name) < math.inf:
                 raise ValueError(f"Matcher.{name}: expected finite metres > {least}, got {getattr(self, name)}")
+
+    @property
+    def maps(self) -> int:
+        """How many there are at a time."""
+        return 1 if self.submap_scans is None or self.known_std is not None else 2
 
     @property
     def spec(self) -> GridSpec:

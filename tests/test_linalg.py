@@ -167,6 +167,15 @@ def test_a_correlation_beyond_one_by_more_than_rounding_is_seen(place, sign, oth
         assert psd(P) is fine
 
 
+def test_roundings_add_up_in_a_large_matrix(tolerance):
+    """A pose and its clone, corrected time and again: a correlation of one, off by a thousand roundings."""
+    rounding, beyond = tolerance(1e3 * 2.0**-52, 1e3 * 2.0**-23), tolerance(1e-11, 1e-2)
+    for excess, fine in ((-beyond, True), (0, True), (rounding, True), (beyond, False)):
+        P = np.diag([4e-12, *np.ones(14)])
+        P[0, 7] = P[7, 0] = 2e-6 * (1 + excess)
+        assert psd(P) is fine
+
+
 @pytest.mark.parametrize("signs", [(-1, -1, -1), (-1, 1, 1), (1, -1, 1), (1, 1, -1)])
 def test_a_determinant_below_zero_by_more_than_rounding_is_seen(signs, tolerance):
     """Correlations of a half whose product is negative leave an eigenvalue of zero; no two of them show more."""

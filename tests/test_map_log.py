@@ -295,7 +295,7 @@ def test_a_map_is_made_in_pieces_as_in_one(tmp_path, monkeypatch):
     log, spec, config = map_log.ready(map_log.read(path, "carmen", fov=math.radians(120)), 0.25, 4.0)
     clock = iter([10.0, 12.0, 15.0])
     monkeypatch.setattr(map_log, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    log_odds, *took = map_log._map(map_log.course_params(), log, config)
+    log_odds, *took = map_log.make_map(map_log.course_params(), log, config)
     assert took == [3, 2]  # seconds of mapping, of compiling
     expected = np.zeros(spec.shape)
     scan = {"origin": spec.origin, "resolution": 0.25, "l_occ": 0.85, "l_free": -0.4}

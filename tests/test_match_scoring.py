@@ -18,10 +18,8 @@ from jaxlocmap.types import Matcher
 DRIVE = dataclasses.replace(simulation.LOOP, steps=90, exact_prior=False, prior_std=(0.01, 0.01, 0.01), beams=31)
 NOISE, PRIOR = simulation.Noise(), DRIVE.prior()
 WORLD = simulation.room()._replace(landmarks=jnp.zeros((0, 2)))
-CONFIG = dataclasses.replace(
-    DRIVE.config(motion="euler", grid=False),
-    matcher=Matcher(period=5, gap=1.0, half_width=9.0, steps=4, submap_scans=4),
-)
+MATCHER = Matcher(period=5, gap=1.0, half_width=9.0, steps=4, submap_scans=4)
+CONFIG = dataclasses.replace(DRIVE.config(motion="euler", grid=False), matcher=MATCHER)
 PARAMS = submaps.with_defaults(simulation.own_params(NOISE, DRIVE))
 RUNS = 3
 
@@ -76,6 +74,8 @@ def test_a_study_scores_what_run_reports(totals, reports, tolerance):
     sums = totals.match.sums
     assert float(sums.tried) == match.tried.sum() == RUNS * 17
     assert float(sums.accepted) == match.accepted.sum()
+    for reason, counted in submaps.refusals(match, MATCHER)._asdict().items():
+        assert float(getattr(sums.refused, reason)) == counted.sum()
     assert float(sums.edge.scored) == match.finished.sum() > 0
     np.testing.assert_allclose(sums.nis, match.nis.sum(), rtol=tolerance(1e-7, 1e-2))
     for i, (name, one) in enumerate((("relative", sums.pose), ("edge", sums.edge))):
@@ -92,6 +92,12 @@ def test_a_report_names_what_matches_tell(totals):
     assert 0.9 < report["match_accept_rate"] <= 1
     assert 0.8 < report["match_points_used"] <= 1
     assert report["submaps_begun_anew"] == 0
+    counts = np.arange(1.0, 5.0)
+    refused = totals._replace(
+        match=totals.match._replace(sums=totals.match.sums._replace(refused=submaps.Refusals(*counts)))
+    )
+    names = ("points", "share", "nis", "convergence")
+    assert [summarise(refused, CONFIG)[f"match_refused_{name}"] for name in names] == [1, 2, 3, 4]
     assert report["relative_count"] == report["matches"]
     assert report["edge_count"] == RUNS * 3
     for name in ("relative", "edge"):
@@ -111,22 +117,25 @@ def test_errors_and_anchors_of_one_step():
     report = none._replace(
         tried=jnp.array(True), accepted=jnp.array(True), points=jnp.array(20), used=jnp.array(15), relative=belief
     )
-    tally, anchors = match_scoring.score_match(report, truth, (older, younger))
+    tally, anchors = match_scoring.score_match(report, truth, (older, younger), MATCHER)
     np.testing.assert_allclose(tally.pose.nees, 25, rtol=1e-4)
     np.testing.assert_allclose(tally.pose.error_square, [9e-4, 16e-4, 0], rtol=1e-4, atol=1e-9)
     np.testing.assert_allclose(tally.used, 0.75)
     assert tally.edge.scored == 0
     np.testing.assert_array_equal(anchors, (older, younger))
-    _, anchors = match_scoring.score_match(report._replace(begun=jnp.array(True)), truth, (older, younger))
+    _, anchors = match_scoring.score_match(report._replace(begun=jnp.array(True)), truth, (older, younger), MATCHER)
     np.testing.assert_array_equal(anchors, (older, truth))
     swap = report._replace(begun=jnp.array(True), finished=jnp.array(True), edge=belief)
-    tally, anchors = match_scoring.score_match(swap, truth, (older, younger))
+    tally, anchors = match_scoring.score_match(swap, truth, (older, younger), MATCHER)
     np.testing.assert_array_equal(anchors, (younger, truth))
     assert tally.edge.scored == 1
     again = none._replace(anew=jnp.array(True), submap=jnp.array(3))
-    tally, anchors = match_scoring.score_match(again, truth, (older, younger))
+    tally, anchors = match_scoring.score_match(again, truth, (older, younger), MATCHER)
     np.testing.assert_array_equal(anchors, (truth, younger))
     assert tally.anew == 1
     assert tally.tried == tally.pose.scored == 0
+    few = none._replace(due=jnp.array(True), points=jnp.array(MATCHER.least_points - 1))
+    refused = match_scoring.score_match(few, truth, (older, younger), MATCHER)[0].refused
+    assert [float(count) for count in refused] == [1, 0, 0, 0]
     first = again._replace(submap=jnp.array(-1))
-    assert match_scoring.score_match(first, truth, (older, younger))[0].anew == 0
+    assert match_scoring.score_match(first, truth, (older, younger), MATCHER)[0].anew == 0

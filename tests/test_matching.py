@@ -183,6 +183,25 @@ def test_off_a_straight_wall_the_residual_is_the_distance(heading, tolerance):
         np.testing.assert_allclose(ahead @ got.slope, off * weight * used.sum(), rtol=0, atol=tolerance(1e-9, 1e-3))
 
 
+@pytest.mark.parametrize("heading", [0.0, 0.4])
+def test_noisy_normals_tell_little_along_a_wall(heading):
+    """Normals 0.1 rad off: each point's own would count sin² of that a point. In the map they are averages over the
+    points of ten scans, so that a tenth of it and less is left.
+    """
+
+    def noisy(seed):
+        turn = 0.1 * np.random.default_rng(seed).normal(size=41)
+        return wall()._replace(normal=jnp.asarray(np.stack([np.cos(turn), np.sin(turn)], axis=1)))
+
+    there, drawn = jnp.array([0.3, -0.2, heading]), jnp.asarray(EMPTY)
+    for seed in range(10):
+        drawn = add(drawn, there, noisy(seed))
+    got = fit(drawn, there, noisy(10), jnp.asarray(SCALE))
+    ahead, along = np.array([np.cos(heading), np.sin(heading), 0]), np.array([-np.sin(heading), np.cos(heading), 0])
+    assert ahead @ got.hessian @ ahead > 0.95 * 41
+    assert along @ got.hessian @ along < 0.1 * 41 * 0.1**2
+
+
 def test_the_derivative_by_the_heading_is_the_residuals_own(x64):
     points, there = wall(), jnp.array([0.3, -0.2, 0.4])
     drawn = add(jnp.asarray(EMPTY), there, points)

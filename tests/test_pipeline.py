@@ -921,7 +921,7 @@ def refused(course, error, message, *, config=SCANNING, params=None, **fields):
         ("landmarks", np.zeros((0, 2)), r"landmarks: expected at least one"),
         ("landmarks", None, r"landmarks: expected \(L, 2\) for the 4 observation slots, got None"),
         ("beam_angles", np.zeros((61, 1)), r"beam_angles: expected shape \(any\), got \(61, 1\)"),
-        ("beam_angles", None, r"beam_angles: expected \(B,\) for the ranges to map, got None"),
+        ("beam_angles", None, r"beam_angles: expected \(B,\) for the ranges to map or to match, got None"),
     ],
 )
 def test_a_shape_that_does_not_fit_is_refused(field, value, message, course):

@@ -203,11 +203,12 @@ def is_psd(P: jax.Array) -> jax.Array:
     """Whether a symmetric (n, n) matrix is finite and positive semi-definite, up to rounding: () bool.
 
     P plus a few roundings of its diagonal has no negative pivot, so that the answer does not depend on units. A pivot
-    of zero is one only if what remains of its row is zero too.
+    of zero is one only if what remains of its row is zero too. In a large matrix, a product of larger ones, roundings
+    add up.
     """
     n = len(P)
     if n > SMALL:
-        lifted = mirrored(P) + jnp.diag(jnp.diagonal(P) * _rounding(P.dtype) + jnp.finfo(P.dtype).tiny)
+        lifted = mirrored(P) + jnp.diag(jnp.diagonal(P) * n**2 * _rounding(P.dtype) + jnp.finfo(P.dtype).tiny)
         return jnp.all(jnp.diagonal(P) >= 0) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(lifted)))
     S = Matrix.symmetric(P)
     lift = 1 + _rounding(P.dtype)

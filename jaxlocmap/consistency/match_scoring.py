@@ -10,9 +10,9 @@ import numpy as np
 
 from jaxlocmap import consistency
 from jaxlocmap.consistency import statistics
-from jaxlocmap.matching.submaps import MatchReport
+from jaxlocmap.matching.submaps import MatchReport, Refusals, refusals
 from jaxlocmap.se2 import POSE, between
-from jaxlocmap.types import Gaussian
+from jaxlocmap.types import Gaussian, Matcher
 
 
 class Relative(NamedTuple):
@@ -31,6 +31,7 @@ class MatchTally(NamedTuple):
     accepted: jax.Array  # ()
     nis: jax.Array  # ()
     used: jax.Array  # () share of the points that lay on lines
+    refused: Refusals  # () each, by reason; several may hold at once
     anew: jax.Array  # () times that the submaps began anew, the first beginning not counted
     pose: Relative  # relative to the anchor of the submap matched on, after the match
     edge: Relative  # between the anchors of finished submaps
@@ -49,11 +50,11 @@ def no_matches(dtype: Any) -> MatchTally:
     """The tally before the first match."""
     zero, each = jnp.zeros((), dtype), jnp.zeros(POSE, dtype)
     none = Relative(zero, zero, each, each)
-    return MatchTally(zero, zero, zero, zero, zero, none, none)
+    return MatchTally(zero, zero, zero, zero, Refusals(zero, zero, zero, zero), zero, none, none)
 
 
 def score_match(
-    report: MatchReport, truth: jax.Array, anchors: tuple[jax.Array, jax.Array]
+    report: MatchReport, truth: jax.Array, anchors: tuple[jax.Array, jax.Array], matcher: Matcher
 ) -> tuple[MatchTally, tuple[jax.Array, jax.Array]]:
     """The tally of one step.
 
@@ -61,6 +62,7 @@ def score_match(
         report: of the step.
         truth: (3,) the true pose after the step.
         anchors: (3,) each, where the robot really was when the older and the younger submap began.
+        matcher: that made the report, static.
 
     Returns:
         The tally, and the anchors after the step.
@@ -72,6 +74,7 @@ def score_match(
         accepted=report.accepted.astype(dtype),
         nis=report.nis,
         used=tried * report.used.astype(dtype) / jnp.maximum(report.points, 1).astype(dtype),
+        refused=Refusals(*(reason.astype(dtype) for reason in refusals(report, matcher))),
         anew=(report.anew & (report.submap >= 0)).astype(dtype),
         pose=_relative(anchors[0], truth, report.relative, report.tried),
         edge=_relative(*anchors, report.edge, report.finished),
@@ -104,6 +107,9 @@ def match_totals(sums: MatchTally) -> MatchTotals:
 def match_fields(totals: Any) -> dict[str, Any]:
     """What the matches of a study say, by name, ready for JSON.
 
+    Those refused are counted by reason (`submaps.Refusals`), of which several may hold at once. A scan with too few
+    points is not matched at all, so it is none of the `matches`.
+
     Args:
         totals: `MatchTotals` of NumPy arrays, summed over runs.
     """
@@ -115,6 +121,7 @@ def match_fields(totals: Any) -> dict[str, Any]:
         "match_accept_rate": float(sums.accepted) / some,
         "match_nis_mean": float(sums.nis) / some,
         "match_points_used": float(sums.used) / some,
+        **{f"match_refused_{reason}": round(float(count)) for reason, count in sums.refused._asdict().items()},
         "submaps_begun_anew": round(float(sums.anew)),
     }
     for i, (name, one) in enumerate((("relative", sums.pose), ("edge", sums.edge))):

@@ -143,8 +143,8 @@ class Study:
                 stepped.scored, stepped.nees, error_square, variance, seen.observed, seen.nis, seen.accepted
             )
             steps, observations = jax.tree.map(jnp.add, (steps, observations), (stepped, seen))
-            if match is not None:
-                matched, anchors = score_match(match, truth[:POSE], anchors)
+            if match is not None and config.matcher is not None:
+                matched, anchors = score_match(match, truth[:POSE], anchors, config.matcher)
                 matches = jax.tree.map(jnp.add, matches, matched)
             return (truth, state, latest, steps, observations, matches, anchors), add_up(at_step)
 

@@ -8,6 +8,7 @@ from typing import Any
 from jaxlocmap.logs.carmen import read_carmen
 from jaxlocmap.logs.mrclam import read_mrclam
 from jaxlocmap.logs.record import Log
+from jaxlocmap.logs.relations import RelationErrors, Relations, read_relations, relation_errors, revisits
 from jaxlocmap.logs.timeline import MAX_GAP, Timeline, to_timeline
 from jaxlocmap.logs.trajectory import Pairs, Trajectory, pair, read_innovations, read_trajectory
 from jaxlocmap.logs.tum import write_tum
@@ -18,6 +19,8 @@ __all__ = [
     "MAX_GAP",
     "Log",
     "Pairs",
+    "RelationErrors",
+    "Relations",
     "Timeline",
     "Trajectory",
     "pair",
@@ -25,8 +28,11 @@ __all__ = [
     "read_carmen",
     "read_innovations",
     "read_mrclam",
+    "read_relations",
     "read_trajectory",
     "read_woods",
+    "relation_errors",
+    "revisits",
     "to_timeline",
     "write_tum",
 ]

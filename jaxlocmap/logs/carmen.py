@@ -34,7 +34,7 @@ _PARAM = re.compile(
 class _Scan(NamedTuple):
     fan: Fan
     ranges: np.ndarray
-    pose: list[float] | None  # the scanner's x, y, theta; None: to be had from odometry
+    pose: list[float] | None  # the scanner's x, y, theta, then the robot's by odometry; None: to be had from ODOM
     stamp: float
     line: int
 
@@ -75,12 +75,12 @@ def read_carmen(
             are the robot's.
 
     Returns:
-        Log with `scan` (S, n), `scan_line` (S,), `beam_angles` (n,) and as truth the scanner's pose x, y, theta of
-        each scan, which is as good as whatever corrected the log; RAWLASER1 without ODOM has no truth. It has no
-        odometry: `to_timeline` refuses it. Counts: `no_return` (inf in `scan`), `bad_ranges` (not positive or NaN:
-        NaN in `scan`), `other_beam_counts` (scans of another number or fan of beams than the most common, left
-        out), `scans_without_pose` (RAWLASER1 outside the time of ODOM, left out), `cut_lines` (a last line with
-        fields missing, left out), `unknown_lines` and `backward_stamps` (scans stay in file order).
+        Log with `scan` (S, n), `scan_line` (S,), `beam_angles` (n,), `scan_odometry` (S, 3), and as truth the scanner's
+        pose x, y, theta of each scan, which is as good as whatever corrected the log; RAWLASER1 without ODOM has
+        neither. It has no wheel speeds: `to_timeline` refuses it. Counts: `no_return` (inf in `scan`), `bad_ranges`
+        (not positive or NaN: NaN in `scan`), `other_beam_counts` (scans of another number or fan of beams than the most
+        common, left out), `scans_without_pose` (RAWLASER1 outside the time of ODOM, left out), `cut_lines` (a last line
+        with fields missing, left out), `unknown_lines` and `backward_stamps` (scans stay in file order).
 
     Raises:
         FileNotFoundError: nothing at `path`.
@@ -136,9 +136,10 @@ def _read(path: str | Path, fov: float | None, max_range: float | None, laser_of
 
     mounted = laser_offset
     if posed:
-        poses = np.array([scan.pose for scan in same])
+        poses, driven = np.split(np.array([scan.pose for scan in same]), 2, axis=1)
     else:
         same, poses = _driven(same, odometry)
+        driven = poses
         counts["scans_without_pose"] = len(scans) - counts["other_beam_counts"] - len(same)
         mounted = laser_offset or [params.get(name, 0.0) for name in ("dx", "dy", "dtheta")]
     scan, time = np.array([scan.ranges for scan in same]), np.array([scan.stamp for scan in same])
@@ -155,6 +156,7 @@ def _read(path: str | Path, fov: float | None, max_range: float | None, laser_of
         scan_time=time,
         scan=np.where(bad, np.nan, np.where(silent, np.inf, scan)),
         scan_line=np.array([scan.line for scan in same], np.int32),
+        scan_odometry=driven,
         beam_angles=angles,
         beam_angles_from=said_by,
         scan_max_range=fan.max_range,
@@ -192,7 +194,7 @@ def _scan(kind: str, fields: list[str], number: int, where: str) -> _Scan:
     return _Scan(
         fan=_stated_fan(fields, beams, where) if head else Fan(beams),
         ranges=np.array(numbers(fields[begin:end], [f"range {k + 1}" for k in range(beams)], where, finite=False)),
-        pose=numbers(fields[rest : rest + 3], middle[:3], where) if middle else None,
+        pose=numbers(fields[rest : rest + 6], middle[:6], where) if middle else None,
         stamp=numbers(fields[-1:], ("time",), where)[0],
         line=number,
     )

@@ -44,6 +44,7 @@ class Log:
     scan_time: np.ndarray = field(default_factory=_NUMBERS)  # (S,) s
     scan: np.ndarray = field(default_factory=_SCANS)  # (S, B) m, inf: no return, NaN: no measurement
     scan_line: np.ndarray = field(default_factory=_INTS)  # (S,) int32: line of the file; (0,) where there are none
+    scan_odometry: np.ndarray = field(default_factory=_POSES)  # (S, 3) m, m, rad: where the wheels say, or (0, 3)
     beam_angles: np.ndarray = field(default_factory=_NUMBERS)  # (B,) rad, scanner's frame
     beam_angles_from: str = ""  # "log", "user" or "assumed": who says them
     scan_max_range: float = math.inf  # m, how far the scanner sees, where the log or the user says
@@ -66,6 +67,7 @@ class Log:
             ("scan_time", (scans,)),
             ("scan", (scans, beams)),
             ("scan_line", (scans if len(self.scan_line) else 0,)),
+            ("scan_odometry", (scans if len(self.scan_odometry) else 0, 3)),
             ("beam_angles", (beams,)),
             ("truth_time", (poses,)),
             ("truth", (poses, 3)),

@@ -85,11 +85,13 @@ def fit(
 ) -> Fit:
     """How far the points of a scan lie off the lines of the map, and how that changes with the pose.
 
-        r = mᵀ (A q - b) / (mᵀ A m),  J = [mᵀ, mᵀ (R p)^⊥],  w = (mᵀ A m / W) / (1 + (r / scale)²)
+        r = mᵀ (A q - b) / (mᵀ A m),  J = mᵀ A [I, (R p)^⊥] / (mᵀ A m),  w = (mᵀ A m / W) / (1 + (r / scale)²)
 
     q is the point in the map's frame, m its normal there, and the sums are read between the centres of four cells, each
-    about its own centre. A point is left out where W is small, where the normals of the map do not agree with its own,
-    or where it lies `REACH` or farther off its line.
+    about its own centre. A m points along the map's own normal, an average over many points. The normal of one point is
+    noisy: a derivative along it would tell of the place along a wall, of which nothing is known. A point is left out
+    where W is small, where the normals of the map do not agree with its own, or where it lies `REACH` or farther off
+    its line.
 
     Args:
         lines, pose, points, spec, at: as of `add_points`.
@@ -117,14 +119,17 @@ def fit(
             xx, xy, yy, weight = xx + w * a, xy + w * b, yy + w * c, weight + w * cell[:, 5]
             off_x = off_x + w * (a * dx + b * dy - cell[:, 3])
             off_y = off_y + w * (b * dx + c * dy - cell[:, 4])
-    agree = normal_x * normal_x * xx + 2 * normal_x * normal_y * xy + normal_y * normal_y * yy
+    along_x, along_y = normal_x * xx + normal_y * xy, normal_x * xy + normal_y * yy  # A m
+    agree = normal_x * along_x + normal_y * along_y
     known = points.valid & inside & (weight > _LEAST_WEIGHT) & (agree > _LEAST_AGREEMENT * weight)
-    residual = (normal_x * off_x + normal_y * off_y) / jnp.where(known, agree, 1)
+    per_agree = 1 / jnp.where(known, agree, 1)
+    residual = (normal_x * off_x + normal_y * off_y) * per_agree
     used = known & (jnp.abs(residual) < REACH)
     residual = jnp.where(used, residual, 0)
     robust = (1 - (residual / REACH) ** 2) / (1 + (residual / scale) ** 2)
     share = jnp.where(used, agree / jnp.where(used, weight, 1) * robust, 0)
-    J = normal_x, normal_y, normal_y * arm_x - normal_x * arm_y
+    J_x, J_y = along_x * per_agree, along_y * per_agree
+    J = J_x, J_y, J_y * arm_x - J_x * arm_y
     hessian = [[jnp.sum(share * J[min(i, j)] * J[max(i, j)]) for j in range(POSE)] for i in range(POSE)]
     slope = jnp.stack([jnp.sum(share * Ji * residual) for Ji in J])
     return Fit(stack_scalars(hessian), slope, residual, used, share)

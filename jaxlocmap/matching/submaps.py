@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxlocmap import checks
 from jaxlocmap._internal.linalg import Matrix, inverse, mirrored
 from jaxlocmap.filters import ekf, information
 from jaxlocmap.matching import lines as line_grid
@@ -39,7 +40,7 @@ _FRESH = (0.5, 0.5, 0.2)  # m, m, rad: standard deviations of a submap's bias be
 class Submaps(NamedTuple):
     """Two overlapping submaps, in the carry of the filter."""
 
-    lines: jax.Array  # (2 * rows, columns, 6): one after the other (`lines.add_points`)
+    lines: jax.Array  # (maps * rows, columns, 6): one after the other (`lines.add_points`)
     older: jax.Array  # () int32: which of the two is the older one
     scans: jax.Array  # (2,) int32: in the older, in the younger one
     travel: jax.Array  # () m: since the last scan was added, turns counted
@@ -52,7 +53,8 @@ class Submaps(NamedTuple):
 class MatchReport(NamedTuple):
     """What a step reports of matching. All zero where none was due."""
 
-    tried: jax.Array  # () bool: a scan was there and a submap to match it on
+    due: jax.Array  # () bool: a scan was to be matched, whatever it saw
+    tried: jax.Array  # () bool: it had points enough, and there was a submap to match it on
     displacement: jax.Array  # (3,) m, m, rad: the pose matched, in the submap's frame, minus the pose predicted
     information: jax.Array  # (3, 3) of the scan alone
     nis: jax.Array  # () squared Mahalanobis distance of the displacement by the predicted covariance
@@ -66,6 +68,15 @@ class MatchReport(NamedTuple):
     anew: jax.Array  # () bool: an older one does: the first of all, or after too many refusals
     finished: jax.Array  # () bool: the older one is finished, and the younger takes its place
     edge: Gaussian  # (3,), (3, 3) m, m, rad: then the younger one's anchor in the frame of the older one's
+
+
+class Refusals(NamedTuple):
+    """Why a match was refused. Several reasons may hold at once."""
+
+    points: jax.Array  # () bool: the scan has fewer points with a normal than `Matcher.least_points`
+    share: jax.Array  # () bool: a smaller share of them lies on lines of the submap than `Matcher.least_share`
+    nis: jax.Array  # () bool: the gate of `Matcher.gate_probability` refuses its squared Mahalanobis distance
+    convergence: jax.Array  # () bool: `Matcher.steps` of Gauss-Newton did not suffice
 
 
 def with_defaults(params: Params, *, std: float = 0.03, scale: float = 0.1, length: float = 0.6) -> Params:
@@ -84,10 +95,37 @@ def with_defaults(params: Params, *, std: float = 0.03, scale: float = 0.1, leng
 def empty(matcher: Matcher, dtype: np.dtype) -> Submaps:
     """Submaps before the first scan."""
     rows, columns = matcher.spec.shape
-    none = jnp.zeros((), jnp.int32)
-    lines = jnp.zeros((2 * rows, columns, line_grid.SUMS), dtype)
-    path = jnp.zeros((), dtype)
-    return Submaps(lines, none, jnp.zeros(2, jnp.int32), path, path, none, none, none)
+    maps, path = (matcher.maps * rows, columns, line_grid.SUMS), ((), dtype)
+    count = (), jnp.int32
+    return Submaps(  # an array each, so that all can be donated
+        lines=jnp.zeros(maps, dtype),
+        older=jnp.zeros(*count),
+        scans=jnp.zeros(2, jnp.int32),
+        travel=jnp.zeros(*path),
+        length=jnp.zeros(*path),
+        steps=jnp.zeros(*count),
+        refused=jnp.zeros(*count),
+        begun=jnp.zeros(*count),
+    )
+
+
+def known(lines: jax.Array, matcher: Matcher, dtype: np.dtype) -> Submaps:
+    """A map that is known, to be matched on and not changed: the only submap, its anchor the frame of the world.
+
+    Args:
+        lines: (rows, columns, 6) as `matcher.spec` has it.
+        matcher: with `known_std`.
+        dtype: of the filter.
+
+    Raises:
+        ValueError: a wrong shape, or a matcher that would change the map.
+    """
+    checks.shape("lines", lines, (*matcher.spec.shape, line_grid.SUMS))
+    if matcher.known_std is None:
+        raise ValueError("matcher.known_std: expected the standard deviations (m, rad) of a known map, got None")
+    return empty(matcher, dtype)._replace(
+        lines=jnp.asarray(lines, dtype), scans=jnp.array([1, 0], jnp.int32), begun=jnp.ones((), jnp.int32)
+    )
 
 
 def no_match(dtype: np.dtype) -> MatchReport:
@@ -95,14 +133,20 @@ def no_match(dtype: np.dtype) -> MatchReport:
     none, real = jnp.zeros((), jnp.int32), jnp.zeros((), dtype)
     vector, square, false = jnp.zeros(POSE, dtype), jnp.zeros((POSE, POSE), dtype), jnp.zeros((), bool)
     pose = Gaussian(vector, square)
-    return MatchReport(false, vector, square, real, false, none, none, false, none, pose, false, false, false, pose)
+    return MatchReport(
+        *(false, false, vector, square, real, false, none, none, false, none, pose, false, false, false, pose)
+    )
 
 
-def extended(belief: Gaussian) -> Gaussian:
+def extended(belief: Gaussian, matcher: Matcher) -> Gaussian:
     """A belief of the motion model's state with room for anchors and biases."""
-    n = len(belief.mean)
-    mean = jnp.zeros(n + EXTRA, belief.mean.dtype).at[:n].set(belief.mean)
-    return Gaussian(mean, jnp.zeros((n + EXTRA,) * 2, belief.mean.dtype).at[:n, :n].set(belief.cov))
+    n, dtype = len(belief.mean), belief.mean.dtype
+    mean = jnp.zeros(n + EXTRA, dtype).at[:n].set(belief.mean)
+    cov = jnp.zeros((n + EXTRA,) * 2, dtype).at[:n, :n].set(belief.cov)
+    if matcher.known_std is not None:
+        bias = np.arange(n + POSE, n + 2 * POSE)
+        cov = cov.at[bias, bias].set(_known_variance(matcher.known_std, dtype))
+    return Gaussian(mean, cov)
 
 
 def travelled(submaps: Submaps, before: jax.Array, after: jax.Array) -> Submaps:
@@ -136,6 +180,7 @@ def match_scan(
     submaps: Submaps,
     ranges: jax.Array,
     *,
+    before: jax.Array,
     scanner: Scanner,
     matcher: Matcher,
     angles: tuple[int, ...],
@@ -148,6 +193,7 @@ def match_scan(
         belief: (n + 12,), predicted to the time of the scan.
         submaps: so far.
         ranges: (B,) m.
+        before: (n + 12,) mean after the step before, corrected: the odometry may tell of no travel, or of too much.
         scanner: with B beams.
         matcher: static.
         angles: entries of the whole state that are angles, static.
@@ -177,26 +223,44 @@ def match_scan(
     moved = boxminus(found.pose, predicted)
     nis = moved @ found.score
     tried = usable & (submaps.scans[0] > 0)
-    gate = ekf.gate_threshold(matcher.gate_probability, POSE)
-    enough = found.used.astype(nis.dtype) >= matcher.least_share * found.points.astype(nis.dtype)
-    sound = tried & found.converged & enough
-    applied = accepted = sound & (nis < gate)
+    report = no_match(nis.dtype)._replace(
+        due=jnp.ones((), bool),
+        tried=tried,
+        displacement=jnp.where(tried, moved, 0),
+        information=jnp.where(tried, found.information, 0),
+        nis=jnp.where(tried, nis, 0),
+        converged=tried & found.converged,
+        points=found.points,
+        used=jnp.where(tried, found.used, 0),
+        submap=number,
+    )
+    refused = refusals(report, matcher)
+    sound = tried & ~(refused.points | refused.share | refused.convergence)
+    applied = accepted = sound & ~refused.nis
     told, gradient = found.information, found.information @ moved + found.score
     if temperature:
-        weight = ekf.gate_weight(nis, gate, temperature)
+        weight = ekf.gate_weight(nis, ekf.gate_threshold(matcher.gate_probability, POSE), temperature)
         applied, told, gradient = sound & jnp.isfinite(nis), weight * told, weight * gradient
     poses = (0, older, younger)
     corrected = information.update(*belief, H, told, gradient, angles=angles, poses=poses)
     belief = _chosen(applied, Gaussian(*corrected), belief)
     refused = jnp.where(accepted, 0, submaps.refused + tried.astype(jnp.int32))
-
+    submaps = travelled(submaps, before, belief.mean)
     relative = _between(belief, older, 0)
+    report = report._replace(accepted=accepted, relative=Gaussian(*(jnp.where(tried, x, 0) for x in relative)))
+    if matcher.known_std is not None:
+        belief = _other_place(belief, older, 1 - jnp.exp(-submaps.travel / length), matcher.known_std)
+        return belief, submaps._replace(travel=jnp.zeros_like(submaps.travel), refused=refused), report
 
     # Begin submaps: the first, the next, or anew after too many refusals.
     active = submaps.scans[1] > 0
-    full = submaps.scans[jnp.where(active, 1, 0)] >= matcher.submap_scans
-    full = full | (submaps.length >= matcher.submap_length)
-    anew = usable & ((submaps.scans[0] == 0) | (refused >= matcher.patience))
+    anew = usable & (submaps.scans[0] == 0)
+    full = jnp.zeros((), bool)
+    if matcher.submap_scans is not None:
+        full = (submaps.scans[jnp.where(active, 1, 0)] >= matcher.submap_scans) | (
+            submaps.length >= matcher.submap_length
+        )
+        anew = usable & ((submaps.scans[0] == 0) | (refused >= matcher.patience))
     due = accepted & full
     finished = due & active
     edge = _between(belief, older, younger)
@@ -206,8 +270,8 @@ def match_scan(
     which = jnp.where(finished, 1 - submaps.older, submaps.older)
     scans = jnp.where(finished, jnp.stack([submaps.scans[1], jnp.zeros((), jnp.int32)]), submaps.scans)
     scans = jnp.where(anew, 0, scans)
-    lines = submaps.lines.reshape(2, -1)
-    for cleared, slot in ((due, 1 - which), (anew, which)):
+    lines = submaps.lines.reshape(matcher.maps, -1)
+    for cleared, slot in ((due, 1 - which), (anew, which)) if matcher.maps == 2 else ():
         # That the index is unique, as one alone is, makes the derivative a plain copy.
         lines = lines.at[jnp.where(cleared, slot, 2)].set(0, mode="drop", unique_indices=True)
     lines = lines.reshape(submaps.lines.shape)
@@ -215,7 +279,7 @@ def match_scan(
     # Add the scan to both.
     added = jnp.stack([accepted | anew, (accepted & active) | due])
     share = 1 - jnp.exp(-submaps.travel / length)
-    for place, entry, slot in ((0, older, which), (1, younger, 1 - which)):
+    for place, entry, slot in ((0, older, which), (1, younger, 1 - which))[: matcher.maps]:
         kappa = jnp.maximum(1 / (scans[place] + 1).astype(std.dtype), share)
         fresh = scans[place] == 0
         pose, H = relative_pose(belief.mean, entry)
@@ -235,23 +299,29 @@ def match_scan(
         refused=jnp.where(anew, 0, refused),
         begun=submaps.begun + (due | anew).astype(jnp.int32),
     )
-    report = MatchReport(
-        tried=tried,
-        displacement=jnp.where(tried, moved, 0),
-        information=jnp.where(tried, found.information, 0),
-        nis=jnp.where(tried, nis, 0),
-        converged=tried & found.converged,
-        points=found.points,
-        used=jnp.where(tried, found.used, 0),
-        accepted=accepted,
-        submap=number,
-        relative=Gaussian(*(jnp.where(tried, x, 0) for x in relative)),
+    report = report._replace(
         begun=due,
         anew=anew,
         finished=finished,
         edge=Gaussian(*(jnp.where(finished, x, 0) for x in edge)),
     )
     return belief, submaps, report
+
+
+def refusals(report: MatchReport, matcher: Matcher) -> Refusals:
+    """Why the match of a step was refused: no reason holds where it was let in, or none was due.
+
+    Args:
+        report: of a step, or of many: any leading shape.
+        matcher: that made it.
+    """
+    dtype = report.nis.dtype
+    return Refusals(
+        points=report.due & (report.points < matcher.least_points),
+        share=report.tried & (report.used.astype(dtype) < matcher.least_share * report.points.astype(dtype)),
+        nis=report.tried & ~(report.nis < ekf.gate_threshold(matcher.gate_probability, POSE)),
+        convergence=report.tried & ~report.converged,
+    )
 
 
 def _chosen(new_if: jax.Array, new: Gaussian, old: Gaussian) -> Gaussian:
@@ -292,6 +362,20 @@ def _moved_bias(
     noise = (gain @ Matrix.symmetric(rel)).array(rel.dtype)
     cov = T @ belief.cov @ T.T
     return Gaussian(belief.mean, mirrored(cov.at[bias, bias].add(kappa**2 * noise)))
+
+
+def _other_place(belief: Gaussian, anchor: int, share: jax.Array, std: tuple[float, float]) -> Gaussian:
+    """The belief after the robot went on over a known map, whose errors are others a little farther on: the bias keeps
+    1 - share of itself, and the rest is drawn anew.
+    """
+    n, bias = len(belief.mean), slice(anchor + POSE, anchor + 2 * POSE)
+    kept = jnp.ones(n, belief.mean.dtype).at[bias].set(1 - share)
+    fresh = jnp.zeros(n, belief.mean.dtype).at[bias].set(_known_variance(std, belief.mean.dtype))
+    return Gaussian(belief.mean * kept, belief.cov * kept * kept[:, None] + jnp.diag((1 - (1 - share) ** 2) * fresh))
+
+
+def _known_variance(std: tuple[float, float], dtype: np.dtype) -> jax.Array:
+    return jnp.asarray((std[0], std[0], std[1]), dtype) ** 2
 
 
 def _between(belief: Gaussian, a: int, b: int) -> Gaussian:

@@ -43,20 +43,7 @@ def trajectory_figure(
         ax.plot(truth[:, 0], truth[:, 1], color=TRUTH, lw=1.5, label="truth")
     ax.plot(estimate[:, 0], estimate[:, 1], color=ESTIMATE, lw=1, label="estimate")
     ax.plot(landmarks[:, 0], landmarks[:, 1], "*", color=EXPECTED, ms=10, label="landmarks")
-    reach = math.sqrt(chi2_quantile(probability, 2))
-    label = f"{100 * probability:.0f} % ellipses of the position"
-    for k in np.linspace(0, len(estimate) - 1, ellipses).astype(int):
-        if not np.all(np.isfinite(cov[k])):
-            continue
-        variance, axes = np.linalg.eigh(cov[k, :2, :2])
-        width, height = 2 * reach * np.sqrt(np.maximum(variance, 0))
-        angle = math.degrees(math.atan2(axes[1, 0], axes[0, 0]))
-        ax.add_patch(
-            Ellipse(
-                (estimate[k, 0], estimate[k, 1]), width, height, angle=angle, fill=False, color="tab:red", label=label
-            )
-        )
-        label = None
+    _ellipses(ax, estimate, cov, probability, ellipses)
     ax.set(xlabel="x [m]", ylabel="y [m]", title=title)
     ax.set_aspect("equal", adjustable="datalim")  # a straight drive would leave no height
     figure.legend(fontsize=8, loc="outside lower center", ncols=5)
@@ -70,6 +57,7 @@ def map_figure(
     poses: np.ndarray,
     *,
     truth: np.ndarray | None = None,
+    cov: np.ndarray | None = None,
     segments: np.ndarray | None = None,
     title: str = "",
 ) -> None:
@@ -79,6 +67,7 @@ def map_figure(
         log_odds: (rows, columns) nats.
         poses: (T, 3) m, m, rad, the path the map was made from.
         truth: (T, 3).
+        cov: (T, 3, 3), for ellipses that hold the position with 95 %.
     """
     figure = Figure(figsize=(9, 8), layout="constrained")
     ax = figure.subplots()
@@ -92,6 +81,8 @@ def map_figure(
     if truth is not None:
         ax.plot(truth[:, 0], truth[:, 1], color=EXPECTED, lw=1.5, label="truth")
     ax.plot(poses[:, 0], poses[:, 1], color=ESTIMATE, lw=1, label="path the map was made from")
+    if cov is not None:
+        _ellipses(ax, poses, cov, 0.95, 25)
     seen_rows, seen_columns = np.nonzero(log_odds)
     if len(seen_rows):  # the picture shows what was seen, with a margin
         margin = 0.05 * max(np.ptp(seen_rows), np.ptp(seen_columns), 10)
@@ -100,6 +91,21 @@ def map_figure(
     ax.set(xlabel="x [m]", ylabel="y [m]", title=title)
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)
     save(figure, path, dpi=150)
+
+
+def _ellipses(ax: Axes, mean: np.ndarray, cov: np.ndarray, probability: float, count: int) -> None:
+    reach = math.sqrt(chi2_quantile(probability, 2))
+    label = f"{100 * probability:.0f} % ellipses of the position"
+    for k in np.linspace(0, len(mean) - 1, count).astype(int):
+        if not np.all(np.isfinite(cov[k])):
+            continue
+        variance, axes = np.linalg.eigh(cov[k, :2, :2])
+        width, height = 2 * reach * np.sqrt(np.maximum(variance, 0))
+        angle = math.degrees(math.atan2(axes[1, 0], axes[0, 0]))
+        ax.add_patch(
+            Ellipse((mean[k, 0], mean[k, 1]), width, height, angle=angle, fill=False, color="tab:red", label=label)
+        )
+        label = None
 
 
 def _limits(cells: np.ndarray, margin: float, origin: float, resolution: float, count: int) -> tuple[float, float]:

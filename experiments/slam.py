@@ -1,0 +1,353 @@
+"""Localise a robot by its laser and wheels alone and map what it sees: every scan is matched on the map of those
+before.
+
+One matching map, no loop closure: coming back to a place corrects the pose where the old walls are near enough to be
+matched, and the covariance, that of the pose since the start, takes nothing from it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from common import CONSOLE, command_line, count_rows, output_folder, params_or, progress_bar, saved, show, write_report
+from map_log import make_map, ready
+
+from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, init, plotting, run
+from jaxlocmap.consistency import readable
+from jaxlocmap.logs import Log, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
+from jaxlocmap.logs.relations import Relations, moved
+from jaxlocmap.mapping import quality
+from jaxlocmap.mapping.ros import save_map
+from jaxlocmap.matching import submaps
+from jaxlocmap.matching.storage import LoadedLines, load_lines, save_lines
+from jaxlocmap.monte_carlo.hosts import merge_kernels
+from jaxlocmap.se2 import POSE
+from jaxlocmap.types import Matcher
+
+_PIECE = 91  # scans between two moves of the progress bar
+_OLDER = POSE  # entry of the state at which the anchor of the map begins
+_START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
+_KNOWN_STD = (0.02, 0.005)  # m, rad: errors of a known map
+_MANY = 0.2  # of the scans: if more are refused, something is wrong
+
+
+@dataclasses.dataclass(frozen=True)
+class SlamConfig:
+    """Settings of the filter, and what it reads."""
+
+    log: tyro.conf.Positional[Path]
+    """The log, plain or gzipped: scans with the odometry of each."""
+    format: Literal["carmen"]
+    """How the log is written."""
+    map: Path | None = None
+    """A map of lines that this program wrote: localise on it and leave it as it is."""
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Pose to start from, m, m, rad: the frame of what is written, or on the known map, to within some 0.2 m and 0.1
+    rad."""
+    odometry: tuple[float, float, float] = (0.15, 0.15, 0.15)
+    """Errors of the wheels along, across and in heading after a metre, m, m, rad; a turn of a radian counts as half a
+    metre."""
+    window: tuple[float, float] = (0.4, 0.4)
+    """How far from the odometry a scan is searched at most, m, rad; less where the covariance is small."""
+    half_width: float = 40.0
+    """Of the matching map about the start, m: what lies beyond is not matched on."""
+    max_range: float = 20.0
+    """Ranges at or beyond are no walls, m."""
+    fov: float | None = None
+    """Degrees from the first beam to the last, symmetric about straight ahead, whatever the log says; where it says
+    nothing, 180 are assumed."""
+    laser_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """DX DY DTHETA of the scanner, m, m, rad, seen from the robot's odometry."""
+    params: Path | None = None
+    """JSON file of parameters, `odometry` and those of matching among them; takes the place of `--odometry`."""
+    relations: Path | None = None
+    """Score the trajectory by relations known from elsewhere: t1 t2 dx dy dz droll dpitch dyaw a line."""
+    reference: Path | None = None
+    """Score it by a trajectory in TUM format with the log's stamps: how the robot moved between two visits of a
+    place."""
+    resolution: float = 0.05
+    """Side of a cell of the occupancy map, m."""
+    seed: int = 0
+    """Nothing here is random; every program has it."""
+    out: Path = Path("out/slam")
+    """Folder for estimate.tum, map.pgm, map.yaml, map.png, lines.npz and report.json."""
+    quick: bool = False
+    """The first 91 scans alone."""
+
+
+def main(config: SlamConfig) -> dict[str, Any]:
+    """Run the filter over the log; write the trajectory, both maps, the picture and the report."""
+    _check(config)
+    out = output_folder(config.out)
+    merge_kernels()
+    fov = None if config.fov is None else math.radians(config.fov)
+    log, repeated = in_order(read(config.log, config.format, fov=fov))
+    if len(log.scan_odometry) != len(log.scan) or not len(log.scan):
+        raise ValueError(f"{config.log}: expected laser scans with odometry, got {len(log.scan)} without")
+    if config.quick:
+        log = _part(log, slice(_PIECE))
+    known = None if config.map is None else load_lines(config.map)
+    scored = _scored(config, log)
+    params = params_or(config.params, believed(config))
+    settings = settings_of(config, log, known)
+    CONSOLE.print(f"{len(log.scan)} scans of {log.scan.shape[1]} beams; compiling takes some seconds")
+    info, state, took = match_log(params, log, settings, config.start, known)
+    poses, cov = on_the_map(info)
+    report = judge(log, info, settings, poses, cov)
+    report["counts"] = {**log.counts, "repeated_stamps": repeated}
+    report |= took | {"params": params.numbers()}
+    report |= {name: _errors(log.scan_time, poses, relations) for name, relations in scored.items()}
+    report |= _write(out, config, log, poses, cov, state, settings, params)
+    report["careful"] = said = doubts(report, config)
+    write_report(out, report)
+    for sentence in said:
+        CONSOLE.print(f"careful: {sentence}", soft_wrap=True)
+    _show(log.name, report)
+    names = ["estimate.tum", "map.pgm", "map.yaml", "map.png", "report.json"]
+    saved(out, *names, *([] if known else ["lines.npz"]))
+    return report
+
+
+def _check(config: SlamConfig) -> None:
+    """Refuse an option out of its range, before anything is read or written."""
+    for name in ("start", "laser_offset"):
+        if not np.all(np.isfinite(getattr(config, name))):
+            raise ValueError(f"{name}: expected three finite numbers, got {getattr(config, name)}")
+    for name in ("max_range", "resolution"):
+        if not 0 < getattr(config, name) < math.inf:
+            raise ValueError(f"{name}: expected metres > 0, got {getattr(config, name)}")
+    if config.fov is not None and not 0 < config.fov <= 360:
+        raise ValueError(f"fov: expected degrees in (0, 360], got {config.fov}")
+
+
+def in_order(log: Log) -> tuple[Log, int]:
+    """The scans sorted by stamp, the first of each, and how many stamps repeated one."""
+    _, first = np.unique(log.scan_time, return_index=True)
+    return _part(log, first), len(log.scan_time) - len(first)
+
+
+def _part(log: Log, scans: Any) -> Log:
+    names = ("scan_time", "scan", "scan_line", "scan_odometry", "truth_time", "truth")
+    kept = {name: getattr(log, name)[scans] for name in names if len(getattr(log, name))}
+    return dataclasses.replace(log, **kept)
+
+
+def _scored(config: SlamConfig, log: Log) -> dict[str, Relations]:
+    """What the trajectory is to be scored by; read before anything is computed."""
+    scored = {}
+    if config.relations is not None:
+        scored["relations"] = read_relations(config.relations)
+    if config.reference is not None:
+        reference = read_trajectory(config.reference)
+        scored["revisits"] = revisits(reference.time, reference.pose)
+    for name, relations in scored.items():
+        common = np.isin(np.round(relations.time, 3), np.round(log.scan_time, 3)).all(axis=1)
+        if not common.any():
+            span = f"{log.scan_time[0]:.3f} to {log.scan_time[-1]:.3f} s"
+            raise ValueError(f"{name}: expected pairs of stamps of the log, {span}, got none: do their clocks differ?")
+    return scored
+
+
+def believed(config: SlamConfig) -> Params:
+    return submaps.with_defaults(Params.from_std(odometry=config.odometry))
+
+
+def settings_of(config: SlamConfig, log: Log, known: LoadedLines | None) -> Config:
+    """One map without an end, or one that is known."""
+    matcher = Matcher(
+        submap_scans=None,
+        resolution=0.1 if known is None else known.resolution,
+        half_width=config.half_width if known is None else known.half_width,
+        steps=20,
+        window=config.window,
+        known_std=None if known is None else _KNOWN_STD,
+    )
+    return Config(
+        dt=1.0,  # a scan, whatever time it took: the noise of the odometry grows with the way
+        motion="odometry",
+        matcher=matcher,
+        max_range=min(config.max_range, log.scan_max_range),
+        scanner_offset=config.laser_offset,
+    )
+
+
+@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
+def _piece(
+    params: Params, state: State, inputs: Inputs, beam_angles: jax.Array, *, config: Config
+) -> tuple[State, Info]:
+    return run(params, state, inputs, beam_angles=beam_angles, config=config)
+
+
+def match_log(
+    params: Params, log: Log, config: Config, start: tuple[float, float, float], known: LoadedLines | None
+) -> tuple[Info, State, dict[str, float]]:
+    """`run` in equal pieces so that a bar can move; the last is filled up with scans of nothing.
+
+    Returns:
+        What every scan reports, the last state, and seconds: of compiling, and of a scan.
+    """
+    scans, angles = len(log.scan), jnp.asarray(log.beam_angles, jnp.float32)
+    steps = np.concatenate([np.zeros((1, POSE)), moved(log.scan_odometry[:-1], log.scan_odometry[1:])])
+    fill = -scans % _PIECE
+    inputs = Inputs(
+        dt=jnp.ones(scans + fill),
+        control=jnp.asarray(np.concatenate([steps, np.zeros((fill, POSE))]), jnp.float32),
+        landmark=jnp.zeros((scans + fill, 0), jnp.int32),
+        z=jnp.zeros((scans + fill, 0, 2)),
+        valid=jnp.zeros((scans + fill, 0), bool),
+        ranges=jnp.asarray(np.concatenate([log.scan, np.full((fill, log.scan.shape[1]), np.nan)]), jnp.float32),
+    )
+    std = jnp.array(_START_STD if known else (0.0, 0.0, 0.0))
+    state = init(Gaussian(jnp.array(start), jnp.diag(std**2)), config=config)
+    if known is not None and config.matcher is not None:
+        state = state._replace(submaps=submaps.known(jnp.asarray(known.lines), config.matcher, np.dtype(np.float32)))
+    began = time.perf_counter()
+    first = jax.tree.map(lambda x: x[:_PIECE], inputs)
+    program = _piece.lower(params, state, first, angles, config=config).compile()
+    compiled, reports = time.perf_counter(), []
+    with progress_bar("matching", scans) as progress:
+        for begin in range(0, scans, _PIECE):
+            piece = jax.tree.map(lambda x, begin=begin: x[begin : begin + _PIECE], inputs)
+            state, info = program(params, state, piece, angles)
+            reports.append(jax.tree.map(np.asarray, info))
+            progress(min(begin + _PIECE, scans))
+    each = 1e3 * (time.perf_counter() - compiled) / (scans + fill)
+    info = jax.tree.map(lambda *pieces: np.concatenate(pieces)[:scans], *reports)
+    return info, state, {"compile_s": compiled - began, "ms_per_scan": each}
+
+
+def on_the_map(info: Info) -> tuple[np.ndarray, np.ndarray]:
+    """The poses on the map, (S, 3): those that its lines were drawn at; and the covariances of the poses since the
+    start, (S, 3, 3).
+    """
+    mean = np.asarray(info.belief.mean, np.float64)
+    local = np.asarray(jax.vmap(lambda mean: submaps.relative_pose(mean, _OLDER)[0])(info.belief.mean), np.float64)
+    anchor = mean[:, _OLDER : _OLDER + POSE]
+    cos, sin = np.cos(anchor[:, 2]), np.sin(anchor[:, 2])
+    x, y = cos * local[:, 0] - sin * local[:, 1], sin * local[:, 0] + cos * local[:, 1]
+    turn = anchor[:, 2] + local[:, 2]
+    poses = np.stack([anchor[:, 0] + x, anchor[:, 1] + y, (turn + np.pi) % (2 * np.pi) - np.pi], axis=-1)
+    return poses, np.asarray(info.belief.cov, np.float64)[:, :POSE, :POSE]
+
+
+def judge(log: Log, info: Info, config: Config, poses: np.ndarray, cov: np.ndarray) -> dict[str, Any]:
+    """What the matches say of themselves."""
+    match, matcher = info.match, config.matcher
+    if matcher is None:
+        raise ValueError("config.matcher: expected a Matcher, got None")
+    refused = jax.tree.map(np.asarray, submaps.refusals(match, matcher))
+    tried = int(match.tried.sum())
+    good = match.accepted | match.anew
+    last = len(good) - 1 - np.flatnonzero(good)[-1] if good.any() else len(good)
+    sigma = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0))
+    return {
+        "log": log.name,
+        "scans": len(log.scan),
+        "beams": log.scan.shape[1],
+        "path_m": float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()),
+        "matched": int(match.accepted.sum()),
+        "tried": tried,
+        "refused": {name: int(reason.sum()) for name, reason in refused._asdict().items()},
+        "refused_last_in_a_row": int(last),
+        "nis_mean": float(match.nis[match.accepted].mean()) if match.accepted.any() else None,
+        "nis_median": float(np.median(match.nis[match.accepted])) if match.accepted.any() else None,
+        "points_used": float((match.used / np.maximum(match.points, 1))[match.tried].mean()) if tried else 0.0,
+        "flagged": int((~info.ok).sum()),
+        "sigma_position_end_m": float(np.hypot(sigma[-1, 0], sigma[-1, 1])),
+        "sigma_position_most_m": float(np.hypot(sigma[:, 0], sigma[:, 1]).max()),
+        "sigma_heading_end_rad": float(sigma[-1, 2]),
+    }
+
+
+def doubts(report: Mapping[str, Any], config: SlamConfig) -> list[str]:
+    """What a user should know before trusting the result."""
+    said, scans, refused = [], report["scans"], report["refused"]
+    if report["matched"] + 1 < (1 - _MANY) * scans:
+        reasons = ", ".join(f"{name} {count}" for name, count in refused.items())
+        where = "is it the map of this place, and --start on it" if config.map else "do --odometry and --fov fit"
+        said.append(f"{scans - report['matched']} of {scans} scans were not matched ({reasons}): {where}?")
+    if report["refused_last_in_a_row"]:
+        said.append(f"the last {report['refused_last_in_a_row']} scans in a row were not matched: the end is odometry")
+    if report["nis_mean"] is not None and report["nis_mean"] > 2 * POSE:
+        said.append(f"matches lie {report['nis_mean']:.1f} from the odometry (3 expected): --odometry is too small")
+    if report["flagged"]:
+        said.append(f"{report['flagged']} steps are flagged: odometry that is not finite, or no covariance")
+    return said
+
+
+def _errors(time: np.ndarray, poses: np.ndarray, relations: Relations) -> dict[str, Any]:
+    error = relation_errors(time, poses, relations)
+    degrees = np.rad2deg(error.rotation)
+    return {
+        "scored": len(degrees),
+        "given": len(relations.time),
+        "translation_m": float(error.translation.mean()),
+        "translation_std_m": float(error.translation.std()),
+        "translation_median_m": float(np.median(error.translation)),
+        "rotation_deg": float(degrees.mean()),
+        "rotation_median_deg": float(np.median(degrees)),
+    }
+
+
+def _write(
+    out: Path,
+    config: SlamConfig,
+    log: Log,
+    poses: np.ndarray,
+    cov: np.ndarray,
+    state: State,
+    settings: Config,
+    params: Params,
+) -> dict[str, Any]:
+    """The trajectory, the occupancy map made at its poses, the map of lines; what the report says of them."""
+    write_tum(out / "estimate.tum", log.scan_time, poses)
+    dx, dy, turn = config.laser_offset
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    scanner = poses + np.stack([cos * dx - sin * dy, sin * dx + cos * dy, np.full(len(poses), turn)], axis=-1)
+    seen = dataclasses.replace(log, truth=scanner, truth_time=log.scan_time)
+    local, spec, mapping = ready(seen, config.resolution, config.max_range)
+    log_odds, _, _ = make_map(params, local, mapping)
+    cells = save_map(out, log_odds, spec, name="map")
+    title = f"{log.name}: {len(poses)} scans matched one after the other, cells of {config.resolution:g} m"
+    plotting.map_figure(out / "map.png", log_odds, spec, poses, cov=cov, title=title)
+    if config.map is None and settings.matcher is not None and state.submaps is not None:
+        save_lines(out / "lines.npz", np.asarray(state.submaps.lines), settings.matcher)
+    return {"entropy_bits": float(quality.entropy_bits(jnp.asarray(log_odds))), "shape": list(cells.shape)}
+
+
+def _show(name: str, report: Mapping[str, Any]) -> None:
+    refused = ", ".join(f"{reason} {count}" for reason, count in report["refused"].items())
+    rows = [
+        ("scans, beams", f"{report['scans']}, {report['beams']}", ""),
+        ("path", f"{report['path_m']:.0f} m", ""),
+        ("matched", f"{report['matched']} of {report['tried']}", ""),
+        ("refused", refused, ""),
+        ("NIS of matches, mean", readable(report["nis_mean"]), "3"),
+        ("points on lines", f"{100 * report['points_used']:.0f} %", ""),
+        ("1 sigma since the start, at the end", f"{report['sigma_position_end_m']:.3f} m", ""),
+        ("a scan, compilation", f"{report['ms_per_scan']:.2f} ms, {report['compile_s']:.1f} s", ""),
+        ("entropy of the map", f"{report['entropy_bits']:.0f} bits", ""),
+    ]
+    for kind in ("relations", "revisits"):
+        if kind in report:
+            score = report[kind]
+            rows += [
+                (f"{kind} scored", f"{score['scored']} of {score['given']}", ""),
+                ("  translation", f"{score['translation_m']:.3f} m, median {score['translation_median_m']:.3f} m", ""),
+                ("  rotation", f"{score['rotation_deg']:.2f}°, median {score['rotation_median_deg']:.2f}°", ""),
+            ]
+    show(name, [*rows, *count_rows(report["counts"])])
+
+
+if __name__ == "__main__":
+    command_line(main, SlamConfig)

@@ -1,0 +1,114 @@
+"""Relations: how far a robot moved between two moments, known from elsewhere, and how well a trajectory agrees."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxlocmap import checks, files
+from jaxlocmap.logs.text import lines, numbers
+
+_FIELDS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
+_SAME_TIME = 1e-4  # s: stamps that agree to this are of one scan; the next one may come 5 ms later
+_APART = 30.0  # s between two visits of a place
+_NEAR = 1.0  # m: as close are two visits of one place
+
+
+class Relations(NamedTuple):
+    """K pairs of moments, and how the robot moved from the first to the second, in its frame at the first."""
+
+    time: np.ndarray  # (K, 2) s
+    moved: np.ndarray  # (K, 3) m, m, rad
+
+
+class RelationErrors(NamedTuple):
+    """Of the relations both of whose moments a trajectory has."""
+
+    translation: np.ndarray  # (M,) m
+    rotation: np.ndarray  # (M,) rad
+    apart: np.ndarray  # (M,) s between the two moments
+
+
+def read_relations(path: str | Path) -> Relations:
+    """Read one relation a line: `t1 t2 dx dy dz droll dpitch dyaw`, s, m and rad.
+
+    Raises:
+        FileNotFoundError: nothing at `path`.
+        ValueError: not text, no relation, or a line with missing, extra or non-numeric fields; the message starts with
+            the path and, where there is one, the line.
+
+    Source: Kümmerle, Steder, Dornhege, Ruhnke, Grisetti, Stachniss & Kleiner 2009 (the benchmark of relations).
+    """
+    with files.reading(path, "relations"):
+        rows = []
+        for number, line in lines(path):
+            fields, where = line.split(), f"{path}:{number}"
+            if len(fields) != len(_FIELDS):
+                raise ValueError(f"{where}: expected {len(_FIELDS)} fields ({', '.join(_FIELDS)}), got {len(fields)}")
+            rows.append(numbers(fields, _FIELDS, where))
+        if not rows:
+            raise ValueError(f"{path}: expected relations, got none")
+    table = np.array(rows)
+    return Relations(table[:, :2], table[:, [2, 3, 7]])
+
+
+def revisits(time: np.ndarray, poses: np.ndarray) -> Relations:
+    """The relations of poses less than a metre apart that more than half a minute lies between.
+
+    Args:
+        time: (T,) s.
+        poses: (T, 3) m, m, rad.
+
+    Raises:
+        ValueError: a wrong shape.
+    """
+    checks.shape("time", time, (None,))
+    checks.shape("poses", poses, (len(time), 3))
+    first, second = [], []
+    for i in range(len(time)):
+        again = np.flatnonzero((time - time[i] > _APART) & (np.hypot(*(poses[:, :2] - poses[i, :2]).T) < _NEAR))
+        first += [i] * len(again)
+        second += again.tolist()
+    return Relations(np.stack([time[first], time[second]], axis=-1), moved(poses[first], poses[second]))
+
+
+def relation_errors(time: np.ndarray, poses: np.ndarray, relations: Relations) -> RelationErrors:
+    """How far a trajectory disagrees with relations: the difference of the movement between its two poses and the
+    relation, component by component. Relations with a moment that is not a stamp of the trajectory are left out:
+    between stamps nothing is known.
+
+        √(dx² + dy²), |dyaw|,  (dx, dy, dyaw) = P(t1)⁻¹ P(t2) - (x, y, yaw) of the relation
+
+    Args:
+        time: (T,) s, increasing.
+        poses: (T, 3) m, m, rad.
+        relations: K of them.
+
+    Raises:
+        ValueError: a wrong shape.
+
+    Source: Kümmerle et al. 2009.
+    """
+    checks.shape("time", time, (None,))
+    checks.shape("poses", poses, (len(time), 3))
+    beyond = np.clip(np.searchsorted(time, relations.time), 1, len(time) - 1)
+    nearest = beyond - (relations.time - time[beyond - 1] < time[beyond] - relations.time)
+    there = np.all(np.abs(time[nearest] - relations.time) < _SAME_TIME, axis=1)
+    first, second = nearest[there].T
+    error = moved(poses[first], poses[second]) - relations.moved[there]
+    return RelationErrors(
+        np.hypot(error[:, 0], error[:, 1]), np.abs(_wrapped(error[:, 2])), np.diff(relations.time[there])[:, 0]
+    )
+
+
+def moved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Poses b in the frames of poses a, (..., 3) each: m, m, rad."""
+    x, y, turn = np.moveaxis(b - a, -1, 0)
+    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
+    return np.stack([cos * x + sin * y, cos * y - sin * x, _wrapped(turn)], axis=-1)
+
+
+def _wrapped(angle: np.ndarray) -> np.ndarray:
+    return (angle + np.pi) % (2 * np.pi) - np.pi
