@@ -64,7 +64,7 @@ def main(config: MapLogConfig) -> dict[str, Any]:
     fov = None if config.fov is None else math.radians(config.fov)
     log = read(config.log, config.format, fov=fov, laser_offset=config.laser_offset)
     if config.quick:
-        log = first_scans(log, _PIECE)
+        log = log.with_scans(slice(_PIECE))
     params = params_or(config.params, course_params())
     mapped, spec, settings = ready(log, config.resolution, config.max_range)
     CONSOLE.print(
@@ -128,12 +128,6 @@ def _check(config: MapLogConfig) -> None:
         raise ValueError(f"fov: expected degrees in (0, 360], got {config.fov}")
     if config.laser_offset is not None and not np.all(np.isfinite(config.laser_offset)):
         raise ValueError(f"laser_offset: expected finite DX DY DTHETA, got {config.laser_offset}")
-
-
-def first_scans(log: Log, count: int) -> Log:
-    """The same log, cut short."""
-    cut = {name: getattr(log, name)[:count] for name in ("scan_time", "scan", "scan_line", "truth_time", "truth")}
-    return dataclasses.replace(log, **cut)
 
 
 def say_doubts(log: Log, max_range: float) -> None:

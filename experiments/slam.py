@@ -38,6 +38,8 @@ _PIECE = 91  # scans between two moves of the progress bar
 _OLDER = POSE  # entry of the state at which the anchor of the map begins
 _START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
 _KNOWN_STD = (0.02, 0.005)  # m, rad: errors of a known map
+_STREAK = 3  # scans in a row that are refused: worth a word
+_LEAST_SHARE = 0.5  # of a scan's points: with fewer, a wall that was never seen passes for another
 _MANY = 0.2  # of the scans: if more are refused, something is wrong
 
 
@@ -95,7 +97,7 @@ def main(config: SlamConfig) -> dict[str, Any]:
     if len(log.scan_odometry) != len(log.scan) or not len(log.scan):
         raise ValueError(f"{config.log}: expected laser scans with odometry, got {len(log.scan)} without")
     if config.quick:
-        log = _part(log, slice(_PIECE))
+        log = log.with_scans(slice(_PIECE))
     known = None if config.map is None else load_lines(config.map)
     scored = _scored(config, log)
     params = params_or(config.params, believed(config))
@@ -133,13 +135,7 @@ def _check(config: SlamConfig) -> None:
 def in_order(log: Log) -> tuple[Log, int]:
     """The scans sorted by stamp, the first of each, and how many stamps repeated one."""
     _, first = np.unique(log.scan_time, return_index=True)
-    return _part(log, first), len(log.scan_time) - len(first)
-
-
-def _part(log: Log, scans: Any) -> Log:
-    names = ("scan_time", "scan", "scan_line", "scan_odometry", "truth_time", "truth")
-    kept = {name: getattr(log, name)[scans] for name in names if len(getattr(log, name))}
-    return dataclasses.replace(log, **kept)
+    return log.with_scans(first), len(log.scan_time) - len(first)
 
 
 def _scored(config: SlamConfig, log: Log) -> dict[str, Relations]:
@@ -169,6 +165,7 @@ def settings_of(config: SlamConfig, log: Log, known: LoadedLines | None) -> Conf
         resolution=0.1 if known is None else known.resolution,
         half_width=config.half_width if known is None else known.half_width,
         steps=20,
+        least_share=_LEAST_SHARE,
         window=config.window,
         known_std=None if known is None else _KNOWN_STD,
     )
@@ -247,8 +244,9 @@ def judge(log: Log, info: Info, config: Config, poses: np.ndarray, cov: np.ndarr
         raise ValueError("config.matcher: expected a Matcher, got None")
     refused = jax.tree.map(np.asarray, submaps.refusals(match, matcher))
     tried = int(match.tried.sum())
-    good = match.accepted | match.anew
-    last = len(good) - 1 - np.flatnonzero(good)[-1] if good.any() else len(good)
+    at = np.concatenate([[-1], np.flatnonzero(match.accepted | match.anew), [len(match.accepted)]])
+    streaks = np.diff(at) - 1
+    longest = int(np.argmax(streaks))
     sigma = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0))
     return {
         "log": log.name,
@@ -258,7 +256,8 @@ def judge(log: Log, info: Info, config: Config, poses: np.ndarray, cov: np.ndarr
         "matched": int(match.accepted.sum()),
         "tried": tried,
         "refused": {name: int(reason.sum()) for name, reason in refused._asdict().items()},
-        "refused_last_in_a_row": int(last),
+        "refused_most_in_a_row": int(streaks[longest]),
+        "refused_most_from_s": float(log.scan_time[at[longest] + 1]) if streaks[longest] else None,
         "nis_mean": float(match.nis[match.accepted].mean()) if match.accepted.any() else None,
         "nis_median": float(np.median(match.nis[match.accepted])) if match.accepted.any() else None,
         "points_used": float((match.used / np.maximum(match.points, 1))[match.tried].mean()) if tried else 0.0,
@@ -276,8 +275,11 @@ def doubts(report: Mapping[str, Any], config: SlamConfig) -> list[str]:
         reasons = ", ".join(f"{name} {count}" for name, count in refused.items())
         where = "is it the map of this place, and --start on it" if config.map else "do --odometry and --fov fit"
         said.append(f"{scans - report['matched']} of {scans} scans were not matched ({reasons}): {where}?")
-    if report["refused_last_in_a_row"]:
-        said.append(f"the last {report['refused_last_in_a_row']} scans in a row were not matched: the end is odometry")
+    if (most := report["refused_most_in_a_row"]) >= _STREAK:
+        said.append(
+            f"{most} scans in a row were not matched, from {report['refused_most_from_s']:.3f} s on: there the pose is "
+            "odometry, and what follows may be matched on the wrong wall"
+        )
     if report["nis_mean"] is not None and report["nis_mean"] > 2 * POSE:
         said.append(f"matches lie {report['nis_mean']:.1f} from the odometry (3 expected): --odometry is too small")
     if report["flagged"]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from common import CONSOLE, scenario_of
 from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of, prior_at, time_sentences
-from map_log import first_scans, ready, say_doubts
+from map_log import ready, say_doubts
 
 from jaxlocmap import Config, Gaussian, Params, simulation, tuning
 from jaxlocmap.consistency.study import Study, summarise
@@ -152,7 +152,7 @@ def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) 
     """
     log = read(path, "carmen")
     scans = min(len(log.scan), 60) if wanted.quick else len(log.scan)
-    log = first_scans(log, scans)
+    log = log.with_scans(slice(scans))
     mapped, _, config = ready(log, resolution, max_range)
     say_doubts(log, config.max_range)
     half = scans // 2

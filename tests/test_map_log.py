@@ -231,7 +231,7 @@ def mapped(monkeypatch):
         log_odds[1, 2], log_odds[0, :3] = 3.0, -2.0
         return log_odds, 2.0, 0.5
 
-    monkeypatch.setattr(map_log, "_map", stub)
+    monkeypatch.setattr(map_log, "make_map", stub)
     monkeypatch.setattr(map_log.plotting, "map_figure", drawn)
     return seen, drawn
 

@@ -111,9 +111,9 @@ SHAPES = {"pose": (3,), "control": (2,), "dt": ()}
 @pytest.mark.parametrize("model", [*motion.MODELS.values(), motion.from_transition(motion.ARC.transition)])
 def test_a_batch_is_refused_by_name(model, name):
     """Five poses side by side would be taken for one, of which only the first three count."""
-    arrays = {key: jnp.ones(shape) for key, shape in SHAPES.items()}
+    arrays = {key: jnp.ones(shape) for key, shape in SHAPES.items()} | {"control": jnp.ones(model.inputs)}
     own = {"pose": "state", "control": "u"} if model not in motion.MODELS.values() else {}
-    for wrong in ((5, *SHAPES[name]), (*SHAPES[name], 1), (1,)):
+    for wrong in ((5, *arrays[name].shape), (*arrays[name].shape, 1), (1,)):
         for function in (model.transition, model.jacobians):
             with pytest.raises(
                 ValueError, match=rf"^{own.get(name, name)}: expected shape .*, got {re.escape(str(wrong))}"
@@ -211,7 +211,9 @@ def test_a_robot_that_turns_round_and_round_keeps_its_heading_inside(name, toler
 
 
 def test_an_unknown_model_is_refused_by_name():
-    with pytest.raises(ValueError, match=r"motion: expected one of \['arc', 'capstone', 'euler'\].*got 'ackermann'"):
+    with pytest.raises(
+        ValueError, match=r"motion: expected one of \['arc', 'capstone', 'euler', 'odometry'\].*got 'ackermann'"
+    ):
         motion.resolve("ackermann")
 
 
@@ -255,3 +257,36 @@ def test_jacobians_keep_structure_so_that_products_with_it_vanish():
     F, G = motion.ARC.jacobians(jnp.zeros(3), jnp.array([1.0, 0.1]), 0.1)
     assert isinstance(F, Matrix)
     assert (F[0, 0], F[0, 1], F[2, 2], G[2, 0]) == (1, 0, 1, 0)
+
+
+# --- displacements by odometry
+
+
+def test_a_displacement_is_composed_with_the_pose(tolerance):
+    pose, control, dt = jnp.array([1.0, 2.0, 2.5]), jnp.array([0.3, -0.1, 1.2]), jnp.array(7.0)
+    got = motion.ODOMETRY.transition(pose, control, dt)
+    c, s = math.cos(2.5), math.sin(2.5)
+    np.testing.assert_allclose(
+        got,
+        [1 + 0.3 * c + 0.1 * s, 2 + 0.3 * s - 0.1 * c, 3.7 - 2 * math.pi],
+        rtol=0,
+        atol=tolerance(1e-14, 1e-6),
+    )
+    F, G = (J.array(pose.dtype) for J in motion.ODOMETRY.jacobians(pose, control, dt))
+    F_jax, by_control = jax.jacfwd(motion.ODOMETRY.transition, argnums=(0, 1))(pose, control, dt)
+    np.testing.assert_allclose(F, F_jax, rtol=0, atol=tolerance(1e-14, 1e-6))
+    path = math.sqrt(0.3**2 + 0.1**2 + 0.6**2 + 0.05**2)
+    np.testing.assert_allclose(G, by_control * math.sqrt(path), rtol=0, atol=tolerance(1e-14, 1e-6))
+
+
+def test_the_noise_of_odometry_grows_with_the_way(tolerance):
+    """A metre in one step or in ten, but for the five centimetres that a step counts at least."""
+    Q = jnp.diag(jnp.array([0.04, 0.09, 1e-8]))
+    for steps in (1, 10):
+        mean, cov = jnp.zeros(3), jnp.zeros((3, 3))
+        for _ in range(steps):
+            control = jnp.array([1 / steps, 0.0, 0.0])
+            mean, cov = ekf.predict(mean, cov, control, jnp.array(1.0), Q, motion=motion.ODOMETRY, nominal_dt=1.0)
+        way = steps * math.hypot(1 / steps, 0.05)
+        np.testing.assert_allclose(mean, [1, 0, 0], rtol=0, atol=tolerance(1e-14, 1e-6))
+        np.testing.assert_allclose(np.diagonal(cov)[:2], [0.04 * way, 0.09 * way], rtol=tolerance(1e-6, 1e-5))

@@ -474,7 +474,9 @@ def test_every_atom_keeps_float32(single):
         )
         occupied = log_odds > 0
         return {
-            "transition": [model.transition(mean, control, dt) for model in motion.MODELS.values()],
+            "transition": [
+                model.transition(mean, control, dt) for model in motion.MODELS.values() if model.inputs == 2
+            ],
             "predict": ekf.predict(mean, cov, control, dt, params.Q, motion=motion.ARC, nominal_dt=0.1),
             "update": ekf.update(mean, cov, residual, H, params.R, threshold=GATE),
             "sensor": [residual, H.array(jnp.float32), sensors.observe(mean, mark, offset=offset)],

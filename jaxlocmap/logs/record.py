@@ -88,3 +88,10 @@ class Log:
                 f"observation_landmark: expected rows from -1 to {len(self.landmarks) - 1}, "
                 f"got {rows.min()} to {rows.max()}"
             )
+
+    def with_scans(self, kept: slice | np.ndarray) -> Log:
+        """The log with these of its scans alone, and with their poses if it has one for each."""
+        names = ["scan_time", "scan", "scan_line", "scan_odometry"]
+        if len(self.truth_time) == len(self.scan_time):
+            names += ["truth_time", "truth"]
+        return dataclasses.replace(self, **{name: x[kept] for name in names if len(x := getattr(self, name))})

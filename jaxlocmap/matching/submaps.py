@@ -371,7 +371,8 @@ def _other_place(belief: Gaussian, anchor: int, share: jax.Array, std: tuple[flo
     n, bias = len(belief.mean), slice(anchor + POSE, anchor + 2 * POSE)
     kept = jnp.ones(n, belief.mean.dtype).at[bias].set(1 - share)
     fresh = jnp.zeros(n, belief.mean.dtype).at[bias].set(_known_variance(std, belief.mean.dtype))
-    return Gaussian(belief.mean * kept, belief.cov * kept * kept[:, None] + jnp.diag((1 - (1 - share) ** 2) * fresh))
+    cov = belief.cov * kept[None, :] * kept[:, None] + jnp.diag((1 - (1 - share) ** 2) * fresh)
+    return Gaussian(belief.mean * kept, cov)
 
 
 def _known_variance(std: tuple[float, float], dtype: np.dtype) -> jax.Array:
