@@ -399,6 +399,7 @@ def test_a_run_in_pieces_is_one_run(matched, tolerance):
         ({"least_share": 0.0}, "least_share"),
         ({"half_width": 0.05}, "half_width"),
         ({"resolution": 0.0}, "resolution"),
+        ({"range_std": 0.0}, "range_std"),
         ({"gap": np.inf}, "gap"),
         ({"submap_length": 0.0}, "submap_length"),
         ({"window": (0.5, 0.0)}, "window"),

@@ -1,0 +1,145 @@
+"""Tuning a filter that matches scans: what is tuned, its gradients against differences, and a gate that weighs."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+from drives import like
+from programs import Enough
+
+from jaxlocmap import init, run, simulation, tuning
+from jaxlocmap.matching import submaps
+from jaxlocmap.tuning.filtering import filtered
+from jaxlocmap.types import Matcher
+
+# Two drives without landmarks, long enough for submaps to begin and to end.
+DRIVE = like(simulation.LOOP, name="drive", steps=90, exact_prior=False, prior_std=(1e-3,) * 3)
+MATCHER = Matcher(period=5, submap_scans=4, gap=0.8, resolution=0.2, half_width=10.0)
+HARD = dataclasses.replace(DRIVE.config(motion="euler", grid=False), matcher=MATCHER)
+CONFIG = dataclasses.replace(HARD, gate_temperature=2.0)
+OWN = submaps.with_defaults(simulation.own_params(simulation.Noise(), DRIVE))
+OBJECTIVE = tuning.Objective(CONFIG, (("pose_nll", 1.0),))
+TUNED = ("v", "w", "match_std", "match_scale", "map_length")
+
+
+@functools.cache
+def drives():
+    world = simulation.room()
+    world = world._replace(landmarks=world.landmarks[:0])
+    return tuning.simulated(jax.random.key(2), 2, world, simulation.Noise(), scenario=DRIVE, scans=True)
+
+
+@pytest.fixture(scope="module")
+def matched():
+    """The last state of the drives, and what each step reported."""
+
+    def one(prior, inputs):
+        return run(OWN, init(prior, config=CONFIG), inputs, beam_angles=DRIVE.beam_angles(), config=CONFIG)
+
+    return jax.jit(jax.vmap(one))(drives().prior, drives().inputs)
+
+
+@pytest.fixture(scope="module")
+def sloped():
+    """`pose_nll` and its derivatives by the coordinates, compiled once."""
+    f = tuning.coordinates_objective(OBJECTIVE, OWN, TUNED)
+    return jax.jit(jax.value_and_grad(lambda at: f(at, drives())[0]))
+
+
+def coordinates():
+    whole = tuning.unconstrain(OWN, OBJECTIVE.blocks)
+    return {name: whole[name] for name in TUNED}
+
+
+def test_a_filter_that_matches_has_three_parameters_more():
+    assert tuning.blocks_of(dataclasses.replace(CONFIG, matcher=None)) == tuning.parameters.BLOCKS
+    names = tuning.names_of(OBJECTIVE.blocks)
+    assert set(names) - set(tuning.NAMES) == {"match_std", "match_scale", "map_length"}
+    assert {tuning.units_of(OBJECTIVE.blocks)[name] for name in names[-5:-2]} == {"m"}
+    back = tuning.constrain(tuning.unconstrain(OWN, OBJECTIVE.blocks), OBJECTIVE.blocks)
+    assert back.blocks == pytest.approx({"match_std": 0.03, "match_scale": 0.1, "map_length": 0.6})
+
+
+def test_what_is_judged_is_the_pose_alone(matched, sloped, tolerance):
+    """Of the 15 entries of the state the first three, matches and all."""
+    _, info = jax.tree.map(np.asarray, matched)
+    assert info.match.accepted.sum() == info.match.tried.sum() > 30
+    assert info.match.finished.any(axis=1).all()
+    error = np.asarray(drives().truth) - info.belief.mean[..., :3]
+    error[..., 2] = (error[..., 2] + np.pi) % (2 * np.pi) - np.pi
+    cov = info.belief.cov[..., :3, :3].astype(float)
+    nees = np.einsum("...i,...ij,...j->...", error, np.linalg.inv(cov), error)
+    expected = 0.5 * (nees + np.linalg.slogdet(cov)[1] + 3 * np.log(2 * np.pi)).mean()
+    assert float(sloped(coordinates())[0]) == pytest.approx(expected, rel=tolerance(1e-9, 1e-2))
+
+
+@pytest.mark.parametrize("name", TUNED)
+def test_a_gradient_is_what_differences_give(name, sloped, x64):
+    at, h = coordinates(), 1e-4
+    up, down = (float(sloped(at | {name: at[name] + step})[0]) for step in (h, -h))
+    assert float(sloped(at)[1][name]) == pytest.approx((up - down) / (2 * h), rel=1e-4)
+
+
+def test_scans_are_needed():
+    batch = drives()
+    without = batch._replace(inputs=batch.inputs._replace(ranges=None))
+    for missing in (without, batch._replace(beam_angles=None)):
+        with pytest.raises(ValueError, match=r"config\.matcher: expected batch\.inputs\.ranges and batch\.beam_angles"):
+            filtered(OWN, missing, config=CONFIG, collect=lambda info, _: info)
+
+
+def test_a_soft_gate_corrects_by_the_weight_of_a_match_and_maps_by_its_decision(matched, x64):
+    """From poses that are believed farther and farther off, a scan with w times its log density."""
+    state, _ = jax.tree.map(lambda x: x[0], matched)
+    ranges = drives().inputs.ranges[0, -1]
+    means = np.tile(np.asarray(state.belief.mean), (12, 1))
+    means[:, 1] += np.linspace(0, 0.14, 12)
+
+    @jax.jit
+    @functools.partial(jax.vmap, in_axes=0)
+    def match(mean):
+        belief = state.belief._replace(mean=mean)
+        scanner = CONFIG.scanner(DRIVE.beam_angles())
+        return submaps.match_scan(
+            OWN,
+            belief,
+            state.submaps,
+            ranges,
+            scanner=scanner,
+            matcher=MATCHER,
+            angles=(2, 5, 8, 11, 14),
+            temperature=2.0,
+        )
+
+    belief, after, report = jax.tree.map(np.asarray, match(jnp.asarray(means)))
+    threshold = scipy.stats.chi2.ppf(MATCHER.gate_probability, 3)
+    np.testing.assert_array_equal(report.accepted, report.nis < threshold)
+    assert 0 < report.accepted.sum() < 12
+    changed = (after.lines != np.asarray(state.submaps.lines)).any(axis=(1, 2, 3))
+    np.testing.assert_array_equal(changed, report.accepted)
+    assert not report.begun.any()
+    P = np.asarray(state.belief.cov)
+    assert report.converged.all()
+    for i in range(12):
+        H = np.asarray(submaps.relative_pose(jnp.asarray(means[i]), 3)[1])
+        rel, told, moved = H @ P @ H.T, report.information[i], report.displacement[i]
+        w = 1 / (1 + np.exp((report.nis[i] - threshold) / 2))
+        pull = w * (told @ moved + np.linalg.solve(rel, moved))
+        shift = P @ H.T @ np.linalg.solve(np.eye(3) + w * told @ rel, pull)
+        np.testing.assert_allclose(belief.mean[i] - means[i], shift, rtol=0, atol=1e-3 * np.abs(shift).max())
+
+
+@pytest.mark.parametrize("config", [CONFIG, HARD])
+def test_the_filter_tells_a_match_how_soft_its_gate_is(config, monkeypatch):
+    def told(*_, temperature, **__):
+        assert temperature == config.gate_temperature
+        raise Enough
+
+    monkeypatch.setattr(submaps, "match_scan", told)
+    first = jax.tree.map(lambda x: x[0], (drives().prior, drives().inputs))
+    with pytest.raises(Enough):
+        run(OWN, init(first[0], config=config), first[1], beam_angles=DRIVE.beam_angles(), config=config)
