@@ -29,7 +29,7 @@ from jaxlocmap.simulation.scenario import (
     own_motion,
     own_params,
 )
-from jaxlocmap.simulation.world import World, building, occupancy, random_room, ray_cast, room
+from jaxlocmap.simulation.world import World, building, occupancy, random_building, random_room, ray_cast, room
 
 __all__ = [
     "BUILDING",
@@ -53,6 +53,7 @@ __all__ = [
     "occupancy",
     "own_motion",
     "own_params",
+    "random_building",
     "random_room",
     "ray_cast",
     "roll_out",
