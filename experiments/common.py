@@ -193,7 +193,8 @@ def scenario_of(name: str) -> simulation.Scenario:
 
 def scenario_world(scenario: simulation.Scenario) -> simulation.World:
     """What stands around the robot of a scenario."""
-    return simulation.building() if scenario.name == simulation.BUILDING.name else simulation.room()
+    buildings = simulation.BUILDING.name, simulation.RANDOM_BUILDING.name
+    return simulation.building() if scenario.name in buildings else simulation.room()
 
 
 def check_gate(gate: float | None, name: str = "gate") -> None:

@@ -33,7 +33,7 @@ from report_table import band, innovation_rows, match_rows, pose_rows, print_ver
 
 from jaxlocmap import Config, Params, init, plotting, run, simulation
 from jaxlocmap.consistency import readable
-from jaxlocmap.consistency.study import Study, reference_study, summarise
+from jaxlocmap.consistency.study import RandomBuildings, Study, reference_study, summarise
 from jaxlocmap.matching.submaps import with_defaults
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.simulation import World
@@ -53,8 +53,9 @@ _SETTINGS = (
 class ConsistencyConfig:
     """Settings of the study."""
 
-    scenario: Literal["capstone", "loop", "building"] = "capstone"
-    """The drive: the course's, two laps through free space, or rounds of a building without landmarks."""
+    scenario: Literal["capstone", "loop", "building", "random_building"] = "capstone"
+    """The drive: the course's, two laps through free space, or rounds of a building without landmarks, the same one or
+    one drawn for each run."""
     steps: int | None = None
     """How many steps of 0.1 s; by default as the scenario has it."""
     motion: Literal["arc", "euler", "capstone"] = "arc"
@@ -118,9 +119,9 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     CONSOLE.print(f"{runs} runs of {scenario.name}, {scenario.steps} steps each")
 
     began = time.perf_counter()
-    totals = study(
-        Study(scenario, settings), key, runs, params, world, noise, prior, config=config.compute, checkpoint=checkpoint
-    )
+    drawn = scenario.name == simulation.RANDOM_BUILDING.name
+    one_run = (RandomBuildings if drawn else Study)(scenario, settings)
+    totals = study(one_run, key, runs, params, world, noise, prior, config=config.compute, checkpoint=checkpoint)
     report = {
         "scenario": scenario.name,
         "motion": config.motion,
@@ -135,7 +136,8 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         plotting.study_figure(out / "nees.png", report, scenario.dt)
         files = ["report.json", "nees.png"]
         if config.map:
-            _picture_of_one_run(out / "map.png", key, params, world, scenario, settings)
+            pictured = simulation.random_building(key) if drawn else world
+            _picture_of_one_run(out / "map.png", key, params, pictured, scenario, settings)
             files.append("map.png")
         _print(report)
         saved(out, *files)

@@ -16,6 +16,7 @@ from drives import like
 from programs import Enough, Recorder, stop
 
 from jaxlocmap import Gaussian, Params, simulation
+from jaxlocmap.consistency.study import RandomBuildings
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import capstone
@@ -86,6 +87,7 @@ CONSISTENCY = (
         ({"own_noise": True}, {"own": True}),
         ({"landmarks": False}, {"landmarks": 0}),
         ({"scenario": "building"}, {"name": "building", "steps": 7200, "landmarks": 0, "walls": 52}),
+        ({"scenario": "random_building"}, {"name": "random_building", "steps": 7200, "landmarks": 0, "walls": 52}),
         ({"match": True}, {"period": 5, "blocks": 3}),
         ({"match": True, "match_every": 2}, {"period": 2, "blocks": 3}),
         ({"match_every": 2}, {}),
@@ -99,6 +101,7 @@ def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
     expected |= {"steps": 1200 if study.scenario.name == "loop" else 240, "landmarks": 4, "walls": 8, "own": False}
     expected |= {"period": None, "blocks": 0, "prior_std": simulation.CAPSTONE.prior_std}
     course, own = simulation.course_params(), simulation.own_params(noise, study.scenario)
+    assert isinstance(study, RandomBuildings) == (config.scenario == "random_building")
     assert {
         "steps": study.scenario.steps,
         "prior_std": study.scenario.prior_std,

@@ -515,7 +515,9 @@ def test_the_loop_is_two_laps_whose_true_start_is_drawn_from_the_prior():
     assert LOOP.steps * LOOP.dt == 2 * 60
     assert (LOOP.exact_prior, CAPSTONE.exact_prior) == (False, True)
     np.testing.assert_allclose(LOOP.start, [9, 5.4, np.pi / 2])
-    assert simulation.SCENARIOS == {"capstone": CAPSTONE, "loop": LOOP, "building": simulation.BUILDING}
+    drawn = dataclasses.replace(simulation.BUILDING, name="random_building")
+    buildings = {"building": simulation.BUILDING, "random_building": drawn}
+    assert {"capstone": CAPSTONE, "loop": LOOP, **buildings} == simulation.SCENARIOS
 
 
 def test_the_tour_of_the_building_goes_through_its_doors_and_no_wall():

@@ -19,7 +19,16 @@ from jaxlocmap import Params, init, run, sensors, simulation
 from jaxlocmap._internal import batching
 from jaxlocmap.consistency import COVERAGE_LEVELS
 from jaxlocmap.consistency.scoring import NEES_EDGES, PHASES, Averages, Undiverged
-from jaxlocmap.consistency.study import MapTotals, Study, Totals, median_nees, pose_means, reference_study, summarise
+from jaxlocmap.consistency.study import (
+    MapTotals,
+    RandomBuildings,
+    Study,
+    Totals,
+    median_nees,
+    pose_means,
+    reference_study,
+    summarise,
+)
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.simulation import CAPSTONE, LOOP, Noise
 
@@ -954,3 +963,26 @@ def test_the_priors_dtype_wins_over_that_of_everything_else(x64):
     args = (simulation.course_params(), simulation.room(), Noise(), prior)
     shapes = jax.eval_shape(Study(SHORT, SHORT_CONFIG), jax.random.key(0), *args)
     assert {leaf.dtype for leaf in jax.tree.leaves(shapes)} == {np.dtype(np.float32)}
+
+
+def test_every_run_has_a_random_building_of_its_own():
+    """Its totals are those of `Study` in the building that its key draws."""
+    scenario = like(simulation.BUILDING, steps=12)
+    config = scenario.config(motion="euler")
+    arguments = simulation.own_params(Noise(), scenario), Noise(), scenario.prior()
+    plain = simulation.building()
+
+    @jax.jit
+    @jax.vmap
+    def both(key):
+        params, *rest = arguments
+        world_key, own_key = jax.random.split(key)
+        drawn = simulation.random_building(world_key)
+        return (
+            RandomBuildings(scenario, config)(key, params, plain, *rest).map,
+            Study(scenario, config)(own_key, params, drawn, *rest).map,
+        )
+
+    got, expected = both(jax.random.split(jax.random.key(0), 3))
+    jax.tree.map(np.testing.assert_array_equal, got, expected)
+    assert len(np.unique(got.brier)) == 3

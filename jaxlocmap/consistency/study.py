@@ -40,7 +40,16 @@ from jaxlocmap.simulation.world import World
 from jaxlocmap.step import Observed, clamp_map, correct, turn
 from jaxlocmap.types import Config, Gaussian, State
 
-__all__ = ["MapTotals", "Study", "Totals", "median_nees", "pose_means", "reference_study", "summarise"]
+__all__ = [
+    "MapTotals",
+    "RandomBuildings",
+    "Study",
+    "Totals",
+    "median_nees",
+    "pose_means",
+    "reference_study",
+    "summarise",
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,6 +202,30 @@ class Study:
         """
         del key, params, world, noise
         return init(prior.first(motion.resolve(self.config.motion).dim), config=self.config)
+
+
+class RandomBuildings(Study):
+    """The same with a building of its own for every run, drawn by `simulation.random_building`."""
+
+    def __call__(
+        self,
+        key: jax.Array,
+        params: Params,
+        world: World,
+        noise: simulation.Noise,
+        prior: Gaussian,
+        *,
+        add_up: Callable[[Any], Any] = lambda own: own,
+    ) -> Totals:
+        """Totals of the run that `key` stands for.
+
+        Args:
+            key, params, noise, prior, add_up: as of `Study`.
+            world: of which the landmarks are observed; the walls are drawn.
+        """
+        world_key, key = jax.random.split(key)
+        drawn = simulation.random_building(world_key)._replace(landmarks=world.landmarks)
+        return super().__call__(key, params, drawn, noise, prior, add_up=add_up)
 
 
 def reference_study(scenario: simulation.Scenario, config: Config, noise: simulation.Noise) -> tuple[Study, Params]:

@@ -188,6 +188,9 @@ def match_scan(
 ) -> tuple[Gaussian, Submaps, MatchReport]:
     """Match a scan on the older submap, correct the belief, and add the scan to both submaps.
 
+    A scan that is refused is added to neither. After `Matcher.patience` refusals in a row the submaps are begun anew at
+    the pose believed in; its covariance does not know of what the scans contradicted, such as a robot carried away.
+
     Args:
         params: with the blocks of matching.
         belief: (n + 12,), predicted to the time of the scan.

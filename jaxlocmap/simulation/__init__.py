@@ -21,6 +21,7 @@ from jaxlocmap.simulation.scenario import (
     BUILDING,
     CAPSTONE,
     LOOP,
+    RANDOM_BUILDING,
     SCENARIOS,
     Detector,
     Noise,
@@ -29,12 +30,13 @@ from jaxlocmap.simulation.scenario import (
     own_motion,
     own_params,
 )
-from jaxlocmap.simulation.world import World, building, occupancy, random_room, ray_cast, room
+from jaxlocmap.simulation.world import World, building, occupancy, random_building, random_room, ray_cast, room
 
 __all__ = [
     "BUILDING",
     "CAPSTONE",
     "LOOP",
+    "RANDOM_BUILDING",
     "SCENARIOS",
     "Detector",
     "Draws",
@@ -53,6 +55,7 @@ __all__ = [
     "occupancy",
     "own_motion",
     "own_params",
+    "random_building",
     "random_room",
     "ray_cast",
     "roll_out",

@@ -232,4 +232,7 @@ BUILDING = Scenario(
 )
 """Three rounds through the rooms and the corridor of `world.building`, where there is no landmark."""
 
-SCENARIOS = {scenario.name: scenario for scenario in (CAPSTONE, LOOP, BUILDING)}
+RANDOM_BUILDING = dataclasses.replace(BUILDING, name="random_building")
+"""The same rounds, of a building that `world.random_building` draws."""
+
+SCENARIOS = {scenario.name: scenario for scenario in (CAPSTONE, LOOP, BUILDING, RANDOM_BUILDING)}

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxlocmap import checks
 from jaxlocmap._internal.batching import scan, zero_of
@@ -34,24 +35,13 @@ def room() -> World:
     )
 
 
-def building() -> World:
-    """A building of 34 x 20 m: a corridor along its middle, three rooms on either side, doors of 1.2 m, furniture, no
-    landmark.
-    """
-    doors = (5.0, 17.0, 29.0)
-    edges = [0.0, *(x + side for x in doors for side in (-0.6, 0.6)), 34.0]
-    walls = [
-        ((0.0, 0.0), (34.0, 0.0)),
-        ((34.0, 0.0), (34.0, 20.0)),
-        ((34.0, 20.0), (0.0, 20.0)),
-        ((0.0, 20.0), (0.0, 0.0)),
-    ]
-    for y in (8.8, 11.2):
-        walls += [((a, y), (b, y)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    for x in (11.0, 23.0):
-        for low, high, door in ((0.0, 8.8, 4.0), (11.2, 20.0, 16.0)):
-            walls += [((x, low), (x, door - 0.6)), ((x, door + 0.6), (x, high))]
-    furniture = [
+_CORRIDOR, _PARTITIONS = (8.8, 11.2), (11.0, 23.0)  # m: y of its walls, x of those between rooms
+_DOORS = (
+    np.array([5.0, 17.0, 29.0]),
+    np.array([4.0, 16.0]),
+)  # m: x of the doors to the corridor, y of those between rooms
+_FURNITURE = np.array(
+    [
         (2.0, 1.0, 3.5, 2.0),
         (8.0, 6.0, 9.0, 7.5),
         (14.0, 6.0, 15.0, 7.5),
@@ -61,10 +51,68 @@ def building() -> World:
         (13.0, 13.0, 14.5, 14.0),
         (6.5, 18.0, 9.0, 19.0),
     ]
+)  # m: from (x, y) to (x, y)
+_CLEAR = np.array(
+    [
+        (0.3, 0.3, 10.7, 3.4),
+        (7.2, 4.6, 10.7, 8.5),
+        (11.3, 4.6, 22.7, 8.5),
+        (11.3, 0.3, 22.7, 3.4),
+        (29.7, 0.3, 33.7, 8.5),
+        (23.3, 16.6, 33.7, 19.7),
+        (11.3, 11.5, 22.7, 15.4),
+        (0.3, 16.6, 10.7, 19.7),
+    ]
+)  # m: where each piece may stand and the tour of the building passes 0.6 m or farther away
+_AJAR, _WIDEST = 0.45, 1.2  # m: from where the tour passes a door to its posts, at least and at most
+_UNUSED, _SHIFT = 1, 3.0  # the door to the corridor that the tour does not pass, and m how far it may be elsewhere
+
+
+def building() -> World:
+    """A building of 34 x 20 m: a corridor along its middle, three rooms on either side, doors of 1.2 m, furniture, no
+    landmark.
+    """
+    to_corridor, between_rooms = (doors[:, None] + np.array([-0.6, 0.6]) for doors in _DOORS)
+    return _furnished(np.stack([to_corridor] * 2), np.stack([between_rooms] * 2), _FURNITURE)
+
+
+def random_building(key: jax.Array) -> World:
+    """`building` with its doors wider or narrower and moved, and its furniture elsewhere in the same rooms.
+
+    The tour of the building scenario leads through the same doors, 0.45 m or more from their posts and 0.6 m or more
+    from the furniture.
+    """
+    of_posts, of_shifts, of_places = jax.random.split(key, 3)
+    dtype = jnp.result_type(float)
+    side = _AJAR + (_WIDEST - _AJAR) * jax.random.uniform(of_posts, (2, 5, 2), dtype)
+    shift = _SHIFT * jax.random.uniform(of_shifts, (2,), dtype, -1.0, 1.0)
+    middle = jnp.asarray(np.concatenate(_DOORS), dtype)[None]
+    posts = jnp.stack([middle - side[..., 0], middle + side[..., 1]], axis=-1)
+    posts = posts.at[:, _UNUSED].add(shift[:, None])
+    size = jnp.asarray(_FURNITURE[:, 2:] - _FURNITURE[:, :2], dtype)
+    free = jnp.asarray(_CLEAR[:, 2:] - _CLEAR[:, :2], dtype) - size
+    corner = jnp.asarray(_CLEAR[:, :2], dtype) + free * jax.random.uniform(of_places, free.shape, dtype)
+    return _furnished(posts[:, :3], posts[:, 3:], jnp.concatenate([corner, corner + size], axis=1))
+
+
+def _furnished(to_corridor: Any, between_rooms: Any, furniture: Any) -> World:
+    """A building of these doors and furniture.
+
+    Args:
+        to_corridor: (2, 3, 2) m: x of the posts of the doors in the lower and the upper wall of the corridor.
+        between_rooms: (2, 2, 2) m: y of those in either partition, in the lower and the upper row of rooms.
+        furniture: (F, 4) m: from (x, y) to (x, y).
+    """
+    walls = [(0.0, 0.0, 34.0, 0.0), (34.0, 0.0, 34.0, 20.0), (34.0, 20.0, 0.0, 20.0), (0.0, 20.0, 0.0, 0.0)]
+    for y, doors in zip(_CORRIDOR, to_corridor, strict=True):
+        edges = [0.0, *doors.ravel(), 34.0]
+        walls += [(a, y, b, y) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    for x, doors in zip(_PARTITIONS, between_rooms, strict=True):
+        for (low, high), door in zip(((0.0, 8.8), (11.2, 20.0)), doors, strict=True):
+            walls += [(x, low, x, door[0]), (x, door[1], x, high)]
     for x0, y0, x1, y1 in furniture:
-        ring = [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
-        walls += [(ring[i], ring[(i + 1) % 4]) for i in range(4)]
-    return World(segments=jnp.array(walls), landmarks=jnp.zeros((0, 2)))
+        walls += [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)]
+    return World(segments=jnp.array(walls).reshape(-1, 2, 2), landmarks=jnp.zeros((0, 2)))
 
 
 def random_room(key: jax.Array) -> World:
