@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from baselines import scan_filters
 from baselines.scan_filters import ON_LINES, ON_OCCUPANCY
@@ -24,13 +24,14 @@ from common import (
 
 from jaxlocmap import Gaussian, Params, consistency, plotting, simulation
 from jaxlocmap.consistency import readable
+from jaxlocmap.consistency.means import average
 from jaxlocmap.matching.submaps import with_defaults
 from jaxlocmap.monte_carlo import hosts, monte_carlo
+from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Config, Matcher
 
 _EXACT = (1e-3, 1e-3, 1e-3)  # m, m, rad: how well the start is known
 _MATCHER = Matcher(period=5, gap=0.8)  # the ends of 61 beams lie far apart
-_STEPS = {"loop": 2400, "building": 7200}
 _CHUNK = 5  # runs at once: their maps are large
 
 
@@ -58,28 +59,13 @@ class Way(NamedTuple):
     law: int | None = None  # which covariance
 
 
-def _ways() -> tuple[Way, ...]:
-    occupancy = {
-        "inverse_hessian": "occupancy grid, absolute, σ² H⁻¹",
-        "hessian": "the same, H itself (Hector SLAM)",
-        "with_prior": "the same, optimiser's with its prior (Cartographer 0.1)",
-        "sandwich": "the same, sandwich",
-        "sandwich_times_30": "the same, sandwich × 30",
-    }
-    lines = {
-        "inverse_hessian": "map of lines, absolute, σ² H⁻¹",
-        "sandwich": "the same, sandwich",
-        "sandwich_times_30": "the same, sandwich × 30",
-        "response_moments": "the same, moments of the response (Olson; Karto)",
-        "unscaled": "the same, (JᵀJ)⁻¹ without σ²",
-    }
-    return (
-        Way("odometry alone", "odometry"),
-        *(Way(occupancy[law.__name__], "on_occupancy", i) for i, law in enumerate(ON_OCCUPANCY)),
-        *(Way(lines[law.__name__], "on_lines", i) for i, law in enumerate(ON_LINES)),
-        Way("point-to-line ICP on keyframes, cloned", "on_keyframes"),
-        Way("this library: submaps, anchor and bias", "on_submaps"),
-    )
+_WAYS = (
+    Way("odometry alone", "odometry"),
+    *(Way(f"occupancy grid, absolute: {label}", "on_occupancy", i) for i, label in enumerate(ON_OCCUPANCY)),
+    *(Way(f"map of lines, absolute: {label}", "on_lines", i) for i, label in enumerate(ON_LINES)),
+    Way("point-to-line ICP on cloned keyframes", "on_keyframes"),
+    Way("this library: submaps with anchor and bias", "on_submaps"),
+)
 
 
 class Scores(NamedTuple):
@@ -120,3 +106,91 @@ class Drive:
         )
         error = jax.vmap(consistency.pose_error)(truth.pose[:: _MATCHER.period], belief.mean)
         return Scores(jax.vmap(consistency.nees)(error, belief.cov), error)
+
+
+def main(config: MatchingConfig) -> dict[str, Any]:
+    """Compare, print the table, write the report and the figure."""
+    out = output_folder(config.out)
+    hosts.check_count("runs", config.runs, least=2)  # whose spread makes a band
+    hosts.use_all_cores()
+    jax.config.update("jax_disable_most_optimizations", config.quick)  # a quick run does little but compile
+    runs = min(config.runs, 4) if config.quick else config.runs
+    worlds = {"loop": 200} if config.quick else {"loop": 2400, "building": 7200}
+    report: dict[str, Any] = {"runs": runs, "seed": config.seed, "worlds": {}}
+    done = 0
+    with progress_bar("simulating", runs * len(_WAYS) * len(worlds)) as progress:
+        for name, steps in worlds.items():
+            scenario = dataclasses.replace(simulation.SCENARIOS[name], steps=steps, exact_prior=False, prior_std=_EXACT)
+            report["worlds"][name] = _world(scenario, runs, config.seed, lambda more, done=done: progress(done + more))
+            done += runs * len(_WAYS)
+    table = _table(report)
+    if config.write:
+        replace_table("matching", table)
+    CONSOLE.print(f"\n{table}", soft_wrap=True)
+    write_report(out, report)
+    plotting.matching_figure(out / "matching_compare.png", report)
+    saved(out, "report.json", "matching_compare.png")
+    return report
+
+
+def _world(scenario: simulation.Scenario, runs: int, seed: int, progress: Callable[[int], None]) -> dict[str, Any]:
+    """Every filter on the same runs."""
+    world, noise = scenario_world(scenario), simulation.Noise()
+    world = world._replace(landmarks=world.landmarks[:0])
+    params = with_defaults(simulation.own_params(noise, scenario))
+    settings = scenario.config(motion=simulation.own_motion(scenario), grid=False)
+    settings = dataclasses.replace(settings, matcher=_MATCHER)
+    devices = len(jax.local_devices())
+    filters = []
+    for i, way in enumerate(_WAYS):
+        law = None if way.law is None else np.int32(way.law)
+        scores = monte_carlo(
+            Drive(scenario, settings, way.filter),
+            jax.random.key(seed),
+            runs,
+            *(params, world, noise, scenario.prior(), law),
+            chunk=min(_CHUNK, -(-runs // devices)),
+            keep_runs=True,
+            progress=lambda done, i=i: progress(i * runs + done),
+        ).value
+        filters.append({"filter": way.name, **_row(*scores)})
+    return {
+        "time_s": (scenario.dt * (1 + np.arange(0, scenario.steps, _MATCHER.period))).tolist(),
+        "nees_band_95": consistency.chi2_band(POSE, runs),
+        "filters": filters,
+    }
+
+
+def _row(nees: np.ndarray, error: np.ndarray) -> dict[str, Any]:
+    """What a table and a figure say of one filter. (runs, T), (runs, T, 3)."""
+    square = np.mean(np.asarray(error, float) ** 2, axis=(0, 1))
+    nees = np.asarray(nees, float)
+    anees = average(nees, POSE)
+    return {
+        "rmse_position_m": float(np.hypot(*np.sqrt(square[:2]))),
+        "rmse_yaw_rad": float(np.sqrt(square[2])),
+        "anees": anees.value,
+        "anees_standard_error": anees.standard_error,
+        "anees_band_95": anees.band_95,
+        "coverage_95": float(np.mean(nees < consistency.chi2_quantile(0.95, POSE))),
+        "flagged_moments": int(np.sum(~np.isfinite(nees))),
+        "nees_per_match": np.nanmean(nees, axis=0).tolist(),
+    }
+
+
+def _table(report: dict[str, Any]) -> str:
+    """One row a filter, four columns a world."""
+    columns = ("position RMSE", "yaw RMSE", "ANEES (3)", "95 % ellipsoid holds")
+    head = ["filter", *(f"{name}: {column}" for name in report["worlds"] for column in columns)]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for rows in zip(*(world["filters"] for world in report["worlds"].values()), strict=True):
+        cells = [rows[0]["filter"]]
+        for row in rows:
+            cells += [f"{row['rmse_position_m']:.3f} m", f"{1e3 * row['rmse_yaw_rad']:.1f} mrad"]
+            cells += [readable(row["anees"]), f"{100 * row['coverage_95']:.1f} %"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    command_line(main, MatchingConfig)

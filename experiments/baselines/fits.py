@@ -16,7 +16,7 @@ from jaxlocmap.matching.normals import Points
 from jaxlocmap.se2 import boxminus
 from jaxlocmap.types import GridSpec
 
-_WEAK = (0.5, 0.5, 0.2)  # m, m, rad: how far a match may stray where the scan says nothing, as along a corridor
+WEAK = (0.5, 0.5, 0.2)  # m, m, rad: standard deviations of a belief that leaves a match to the scan
 _PAIR = 0.5  # m: points of two scans farther apart than this do not belong together
 _PARALLEL = 0.8  # least cosine between their normals
 _STEPS = 10  # of Gauss-Newton
@@ -33,6 +33,11 @@ class Fit(NamedTuple):
     def hessian(self) -> jax.Array:
         """Σ w Jᵀ J, (3, 3)."""
         return self.slope.T @ (self.weight[:, None] * self.slope)
+
+    @property
+    def pull(self) -> jax.Array:
+        """Σ w Jᵀ r, (3,)."""
+        return self.slope.T @ (self.weight * self.residual)
 
     @property
     def used(self) -> jax.Array:
@@ -105,25 +110,39 @@ def on_scan(reference: Points, pose: jax.Array, points: Points, scale: jax.Array
     return Fit(residual, slope, jnp.where(used, 1 / (1 + (residual / scale) ** 2), 0))
 
 
-def solve(fit: Callable[[jax.Array], Fit], start: jax.Array, std: jax.Array | float) -> jax.Array:
-    """The pose at which a scan fits best, by Gauss-Newton steps of
+class Solution(NamedTuple):
+    """Where a scan fits best, and what the scan alone says there."""
 
-        min  Σ w r² / std² + |ξ - start|² in D,  D so weak that it matters only where the scan says nothing
+    pose: jax.Array  # (3,) m, m, rad
+    fit: Fit  # there
+
+    def shift(self, mean: jax.Array, variance: jax.Array) -> jax.Array:
+        """From a pose (3,) to the one that the scan alone would choose, (3,) m, m, rad: (Λ + D)⁻¹ g with g and Λ of its
+        log density. D is so weak that it matters only where the scan says nothing, as along a corridor.
+        """
+        told = self.fit.hessian / variance
+        gradient = told @ boxminus(self.pose, mean) - self.fit.pull / variance
+        weak = jnp.diag(jnp.asarray([1 / s**2 for s in WEAK], told.dtype))
+        return inverse(Matrix.symmetric(told + weak)).array(told.dtype) @ gradient
+
+
+def solve(fit: Callable[[jax.Array], Fit], mean: jax.Array, cov: jax.Array, std: jax.Array | float) -> Solution:
+    """The pose that is the most probable, by Gauss-Newton steps of
+
+        min  Σ w r² / std² + |ξ - mean|² in cov⁻¹
 
     Args:
         fit: at a pose.
-        start: (3,) m, m, rad.
+        mean: (3,) m, m, rad.
+        cov: (3, 3), which may be singular.
         std: () of a residual.
-
-    Returns:
-        (3,), its heading not wrapped.
     """
-    weak = jnp.asarray([1 / s**2 for s in _WEAK], start.dtype)
+    P = Matrix.symmetric(cov)
 
     def step(pose: jax.Array, _: None) -> tuple[jax.Array, None]:
         found = fit(pose)
-        pull = found.slope.T @ (found.weight * found.residual) / std**2 + weak * boxminus(pose, start)
-        whole = Matrix.symmetric(found.hessian / std**2 + jnp.diag(weak))
-        return pose - inverse(whole).array(pose.dtype) @ pull, None
+        gain = inverse(Matrix.identity(len(mean)) + P @ Matrix.symmetric(found.hessian / std**2)).array(pose.dtype)
+        return pose - gain @ (cov @ found.pull / std**2 + boxminus(pose, mean)), None
 
-    return jax.lax.scan(step, start, length=_STEPS)[0]
+    pose, _ = jax.lax.scan(step, mean, length=_STEPS)
+    return Solution(pose, fit(pose))

@@ -1,9 +1,10 @@
-"""Other ways to correct a pose by scans: as absolute measurements, with the covariances that are in use, and relative to
-a keyframe. All filter one drive, in blocks of as many steps as lie between two matches.
+"""Other ways to correct a pose by scans: as absolute measurements, with the covariances that are in use, and relative
+to a keyframe. Each filters one drive, in blocks of as many steps as lie between two matches.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from jaxlocmap.mapping import grid
 from jaxlocmap.matching import lines as line_grid
 from jaxlocmap.matching.normals import Points, surface_points
 from jaxlocmap.matching.submaps import MATCH_SCALE, MATCH_STD
-from jaxlocmap.se2 import POSE, between, boxminus
+from jaxlocmap.se2 import POSE, between
 from jaxlocmap.step import predict
 from jaxlocmap.types import Gaussian, Matcher, Scanner
 
@@ -31,7 +32,7 @@ _PROBABILITY_STD = 0.3  # of a residual on the occupancy grid, for the solver al
 _CERES = (20.0, 1.0, 100.0, 2.34e-4)  # weights of scan, translation and rotation, and the scale of the covariance
 _RESPONSE_DROP = 0.1  # below the best response: what is less does not count
 _SMEAR = 0.03  # m
-_WINDOW, _TURN = (0.14, 15), (0.01745, 11)  # m, rad to either side, and how many
+_SHIFTS, _TURNS = (0.14, 15), (0.01745, 11)  # m, rad to either side, and how many
 _KEYFRAME = (1.0, 0.5)  # m, rad from the last one: then a new one
 _LEAST = 1e-6  # beside a matrix that may be singular, as a share of its trace
 
@@ -45,94 +46,103 @@ class Scan(NamedTuple):
 
 
 class Matched(NamedTuple):
-    """What a covariance is made of."""
+    """What a match found, of which a correction is made."""
 
+    shift: jax.Array  # (3,) m, m, rad: from the pose predicted to the best one
     fit: Fit  # at the best pose
     variance: jax.Array  # () of a residual
-    response: Callable[[jax.Array], jax.Array]  # (K, 3) poses less the best one -> (K,) share of the scan that fits
 
 
-# ---- What is taken for the covariance of a match, as its inverse (3, 3) ---------------------------------------------
+class Told(NamedTuple):
+    """What the filter is told of its pose, as of `information.update`."""
+
+    information: jax.Array  # (3, 3) R⁻¹
+    gradient: jax.Array  # (3,)
+
+
+# ---- What is taken for the covariance R of a match ------------------------------------------------------------------
 
 
 def _inverse(matrix: jax.Array) -> jax.Array:
-    """Also of one that is singular, to which a little is added in either unit."""
-    lifted = matrix + _LEAST * jnp.diag(jnp.diagonal(matrix)) + jnp.finfo(matrix.dtype).tiny
+    """Also of one that is singular: a little is added to its diagonal."""
+    lifted = matrix + _LEAST * jnp.diag(jnp.diagonal(matrix)) + jnp.finfo(matrix.dtype).tiny * jnp.eye(POSE)
     return inverse(Matrix.symmetric(lifted)).array(matrix.dtype)
 
 
-def inverse_hessian(matched: Matched) -> jax.Array:
+def _measured(matched: Matched, information: jax.Array) -> Told:
+    """The best pose, measured with that inverse covariance."""
+    return Told(information, information @ matched.shift)
+
+
+def inverse_hessian(matched: Matched) -> Told:
     """R = σ² (Σ w Jᵀ J)⁻¹."""
-    return matched.fit.hessian / matched.variance
+    return _measured(matched, matched.fit.hessian / matched.variance)
 
 
-def sandwich(matched: Matched) -> jax.Array:
-    """R = Λ⁻¹ (Σ w² r² Jᵀ J / σ⁴) Λ⁻¹, Λ = Σ w Jᵀ J / σ². Source: White 1982."""
+def sandwich(matched: Matched, factor: float = 1.0) -> Told:
+    """R = factor · Λ⁻¹ (Σ w² r² Jᵀ J / σ⁴) Λ⁻¹, Λ = Σ w Jᵀ J / σ². Source: White 1982."""
     residual, J, weight = matched.fit
-    told = inverse_hessian(matched)
+    information = matched.fit.hessian / matched.variance
     middle = J.T @ ((weight * residual / matched.variance)[:, None] ** 2 * J)
-    return told @ _inverse(middle) @ told
+    return _measured(matched, information @ _inverse(middle) @ information / factor)
 
 
-def sandwich_times_30(matched: Matched) -> jax.Array:
-    """R thirty times that of `sandwich`."""
-    return sandwich(matched) / 30
-
-
-def hessian(matched: Matched) -> jax.Array:
+def hessian(matched: Matched) -> Told:
     """R = Σ Jᵀ J, in cells and radians, as Hector SLAM publishes it."""
     cells = jnp.diag(jnp.asarray([SPEC.resolution, SPEC.resolution, 1], matched.variance.dtype))
-    return _inverse(cells @ matched.fit.hessian @ cells)
+    return _measured(matched, _inverse(cells @ matched.fit.hessian @ cells))
 
 
-def with_prior(matched: Matched) -> jax.Array:
-    """R = s (a² Σ Jᵀ J / n + diag(b², b², c²))⁻¹: that of an optimiser that is held back to where it began, with the
-    weights a, b, c and the scale s of Cartographer 0.1.
+def with_prior(matched: Matched) -> Told:
+    """R = s (a² Σ Jᵀ J / n + diag(b², b², c²))⁻¹, of an optimiser that weighs the scan against the pose it began at,
+    and the pose that it finds: with the weights a, b, c and the scale s of Cartographer 0.1.
     """
     scan, translation, rotation, scale = _CERES
-    points = jnp.maximum(jnp.sum(matched.fit.weight), 1)
-    prior = jnp.diag(jnp.asarray([translation**2, translation**2, rotation**2], points.dtype))
-    return (scan**2 * matched.fit.hessian / points + prior) / scale
+    information = scan**2 / scale * matched.fit.hessian / jnp.maximum(jnp.sum(matched.fit.weight), 1)
+    prior = jnp.diag(jnp.asarray([translation**2, translation**2, rotation**2], information.dtype)) / scale
+    return Told(information + prior, information @ matched.shift)
 
 
-def unscaled(matched: Matched) -> jax.Array:
+def unscaled(matched: Matched) -> Told:
     """R = (Σ w Jᵀ J)⁻¹."""
-    return matched.fit.hessian
+    return _measured(matched, matched.fit.hessian)
 
 
-def response_moments(matched: Matched) -> jax.Array:
+def response_moments(matched: Matched, response: Callable[[jax.Array], jax.Array]) -> Told:
     """R the second moments of the responses about the best pose, as Karto has them: over shifts at the best heading and
-    over turns at the best place, of the responses less than 0.1 below the best, weighted by themselves.
+    over turns at the best place, of the responses less than 0.1 below the best, weighted by themselves, and the larger
+    the poorer the best one is.
+
+    Args:
+        matched: as of the others.
+        response: (K, 3) poses less the best one -> (K,) share of the scan that fits.
 
     Source: Olson 2009, section IV.
     """
     dtype = matched.variance.dtype
-    (reach, shifts), (angle, turns) = _WINDOW, _TURN
-    x, y = (v.ravel() for v in jnp.meshgrid(*[jnp.linspace(-reach, reach, shifts, dtype=dtype)] * 2, indexing="ij"))
-    turn = jnp.linspace(-angle, angle, turns, dtype=dtype)
-    best = matched.response(jnp.zeros((1, POSE), dtype))[0]
+    (reach, shifts), (angle, turns) = _SHIFTS, _TURNS
+    shift, turn = jnp.linspace(-reach, reach, shifts, dtype=dtype), jnp.linspace(-angle, angle, turns, dtype=dtype)
+    x, y = (v.ravel() for v in jnp.meshgrid(shift, shift, indexing="ij"))
+    best = response(jnp.zeros((1, POSE), dtype))[0]
 
-    def share(poses: jax.Array) -> jax.Array:
-        response = matched.response(poses)
-        counted = jnp.where(response >= best - _RESPONSE_DROP, response, 0)
+    def weight(poses: jax.Array) -> jax.Array:
+        share = response(poses)
+        counted = jnp.where(share >= best - _RESPONSE_DROP, share, 0)
         return counted / jnp.maximum(jnp.sum(counted), jnp.finfo(dtype).tiny)
 
-    moved = share(jnp.stack([x, y, jnp.zeros_like(x)], axis=1))
-    turned = share(jnp.stack([jnp.zeros_like(turn), jnp.zeros_like(turn), turn], axis=1))
+    moved = weight(jnp.stack([x, y, jnp.zeros_like(x)], axis=1))
+    turned = weight(jnp.stack([jnp.zeros_like(turn), jnp.zeros_like(turn), turn], axis=1))
     xx, xy, yy = (jnp.sum(moved * a * b) for a, b in ((x, x), (x, y), (y, y)))
     least_shift, least_turn = (2 * reach / (shifts - 1)) ** 2 / 10, (2 * angle / (turns - 1)) ** 2
-    none = jnp.zeros((), dtype)
-    R = [
-        [jnp.maximum(xx, least_shift), xy, none],
-        [xy, jnp.maximum(yy, least_shift), none],
-        [none, none, jnp.maximum(jnp.sum(turned * turn**2), least_turn)],
-    ]
-    return _inverse(jnp.stack([jnp.stack(row) for row in R]) / jnp.maximum(best, _RESPONSE_DROP))
+    spread = jnp.diag(jnp.stack([jnp.maximum(xx, least_shift), jnp.maximum(yy, least_shift), least_turn]))
+    spread = spread.at[0, 1].set(xy).at[1, 0].set(xy).at[2, 2].max(jnp.sum(turned * turn**2))
+    return _measured(matched, _inverse(spread / jnp.maximum(best, _RESPONSE_DROP)))
 
 
-Law = Callable[[Matched], jax.Array]
-ON_OCCUPANCY: tuple[Law, ...] = (inverse_hessian, hessian, with_prior, sandwich, sandwich_times_30)
-ON_LINES: tuple[Law, ...] = (inverse_hessian, sandwich, sandwich_times_30, response_moments, unscaled)
+# What follows "the same" in a table.
+ON_OCCUPANCY = ("σ² H⁻¹", "H itself (Hector SLAM)", "the optimiser's with its prior (Cartographer 0.1)")
+ON_LINES = ("σ² H⁻¹", "sandwich", "sandwich × 30", "moments of the response (Karto)", "(JᵀJ)⁻¹ without σ²")
+_Choices = list[Callable[[], Told]]
 
 
 # ---- The filters -----------------------------------------------------------------------------------------------------
@@ -153,18 +163,20 @@ def odometry(params: Params, prior: Gaussian, inputs: Inputs, *, scanner: Scanne
 def on_occupancy(
     params: Params, prior: Gaussian, inputs: Inputs, *, scanner: Scanner, config: Config, law: jax.Array
 ) -> Gaussian:
-    """Matches on one occupancy grid, taken for absolute measurements. law: () int32, of `ON_OCCUPANCY`."""
+    """Matches on one occupancy grid, taken for absolute measurements. law: () int32, into `ON_OCCUPANCY`."""
     hit, miss = (jnp.asarray(x, prior.mean.dtype) for x in (_HIT, _MISS))
 
     def correct(belief: Gaussian, log_odds: jax.Array, scan: Scan) -> tuple[Gaussian, Any]:
         def fit(pose: jax.Array) -> Fit:
             return fits.on_occupancy(log_odds, pose, scan.points.xy, scan.hit, spec=SPEC)
 
-        pose = fits.solve(fit, belief.mean, _PROBABILITY_STD)
-        found = fit(pose)
-        variance = jnp.sum(found.weight * found.residual**2) / jnp.maximum(jnp.sum(found.weight) - POSE, 1)
-        matched = Matched(found, variance, lambda shifts: jnp.zeros(len(shifts), pose.dtype))
-        belief = _absolute(belief, pose, matched, ON_OCCUPANCY, law)
+        weak = jnp.diag(jnp.asarray(fits.WEAK, belief.mean.dtype) ** 2)
+        found = fits.solve(fit, belief.mean, weak, _PROBABILITY_STD)
+        residual, _, weight = found.fit
+        variance = jnp.sum(weight * residual**2) / jnp.maximum(jnp.sum(weight) - POSE, 1)
+        matched = Matched(found.shift(belief.mean, variance), found.fit, variance)
+        choices: _Choices = [functools.partial(own, matched) for own in (inverse_hessian, hessian, with_prior)]
+        belief = _absolute(belief, matched, choices, law)
         return belief, grid.add_scan(log_odds, belief.mean, scan.ranges, hit, miss, scanner=scanner, spec=SPEC)
 
     return _filtered(correct, prior, jnp.zeros(SPEC.shape, prior.mean.dtype), params, inputs, scanner, config)
@@ -173,38 +185,48 @@ def on_occupancy(
 def on_lines(
     params: Params, prior: Gaussian, inputs: Inputs, *, scanner: Scanner, config: Config, law: jax.Array
 ) -> Gaussian:
-    """Matches on one map of lines, taken for absolute measurements. law: () int32, of `ON_LINES`."""
+    """Matches on one map of lines, taken for absolute measurements. law: () int32, into `ON_LINES`."""
     std, scale = params.block(MATCH_STD), params.block(MATCH_SCALE)
 
     def correct(belief: Gaussian, lines: jax.Array, scan: Scan) -> tuple[Gaussian, Any]:
         def fit(pose: jax.Array) -> Fit:
             return fits.on_lines(lines, pose, scan.points, scale, spec=SPEC)
 
-        pose = fits.solve(fit, belief.mean, std)
+        found = fits.solve(fit, *belief, std)
 
         def response(shifts: jax.Array) -> jax.Array:
             def one(shift: jax.Array) -> jax.Array:
-                turned = line_grid.placed((pose + shift).at[:2].set(0), scan.points)
-                return line_grid.overlap(lines, pose[:2] + shift[:2], turned, jnp.full_like(std, _SMEAR), spec=SPEC)
+                pose = found.pose + shift
+                turned = line_grid.placed(pose.at[:2].set(0), scan.points)
+                return line_grid.overlap(lines, pose[:2], turned, jnp.full_like(std, _SMEAR), spec=SPEC)
 
             points = jnp.maximum(jnp.sum(scan.points.valid), 1).astype(std.dtype)
             return jax.vmap(one)(shifts) / points
 
-        belief = _absolute(belief, pose, Matched(fit(pose), std**2, response), ON_LINES, law)
+        matched = Matched(found.shift(belief.mean, std**2), found.fit, std**2)
+        belief = _absolute(
+            belief,
+            matched,
+            [
+                functools.partial(inverse_hessian, matched),
+                functools.partial(sandwich, matched),
+                functools.partial(sandwich, matched, 30.0),
+                functools.partial(response_moments, matched, response),
+                functools.partial(unscaled, matched),
+            ],
+            law,
+        )
         return belief, line_grid.add_points(lines, belief.mean, scan.points, spec=SPEC)
 
     lines = jnp.zeros((*SPEC.shape, line_grid.SUMS), prior.mean.dtype)
     return _filtered(correct, prior, lines, params, inputs, scanner, config)
 
 
-def _absolute(
-    belief: Gaussian, pose: jax.Array, matched: Matched, laws: tuple[Law, ...], law: jax.Array
-) -> Gaussian:
-    """The belief corrected by a pose that is taken for measured."""
-    told = jax.lax.switch(law, [lambda own=own: own(matched) for own in laws])
-    told = jnp.where(matched.fit.used >= _LEAST_POINTS, told, 0)
-    H = jnp.eye(POSE, dtype=told.dtype)
-    return Gaussian(*information.update(*belief, H, told, told @ boxminus(pose, belief.mean)))
+def _absolute(belief: Gaussian, matched: Matched, choices: _Choices, law: jax.Array) -> Gaussian:
+    """The belief corrected by a match that is taken for a measurement of the pose itself."""
+    told = jax.lax.switch(law, choices)
+    told = jax.tree.map(lambda x: jnp.where(matched.fit.used >= _LEAST_POINTS, x, 0), told)
+    return Gaussian(*information.update(*belief, jnp.eye(POSE, dtype=belief.mean.dtype), *told))
 
 
 class Keyframe(NamedTuple):
@@ -226,18 +248,15 @@ def on_keyframes(params: Params, prior: Gaussian, inputs: Inputs, *, scanner: Sc
 
         predicted, by_keyframe, by_pose = between(belief.mean[POSE:], belief.mean[:POSE])
         H = jnp.concatenate([by_pose.array(std.dtype), by_keyframe.array(std.dtype)], axis=1)
-        pose = fits.solve(fit, predicted, std)
-        found = fit(pose)
-        told = jnp.where(keyframe.known & (found.used >= _LEAST_POINTS), found.hessian / std**2, 0)
-        pull = told @ boxminus(pose, predicted)
+        found = fits.solve(fit, predicted, H @ belief.cov @ H.T, std)
+        told = jnp.where(keyframe.known & (found.fit.used >= _LEAST_POINTS), found.fit.hessian / std**2, 0)
+        pull = told @ found.shift(predicted, std**2)
         belief = Gaussian(*information.update(*belief, H, told, pull, angles=(2, 5), poses=(0, POSE)))
         away, _, _ = between(belief.mean[POSE:], belief.mean[:POSE])
         new = ~keyframe.known | (jnp.hypot(away[0], away[1]) > _KEYFRAME[0]) | (jnp.abs(away[2]) > _KEYFRAME[1])
         clone = jnp.tile(jnp.arange(POSE), 2)
         cloned = Gaussian(belief.mean[clone], belief.cov[clone][:, clone])
-        return jax.tree.map(
-            lambda a, b: jnp.where(new, a, b), (cloned, Keyframe(scan.points, new)), (belief, keyframe)
-        )
+        return jax.tree.map(lambda a, b: jnp.where(new, a, b), (cloned, Keyframe(scan.points, new)), (belief, keyframe))
 
     beams = len(scanner.beam_angles)
     nothing = jnp.zeros((beams, 2), prior.mean.dtype)
@@ -270,6 +289,8 @@ def _filtered(
     correct: _Correct, prior: Gaussian, memory: Any, params: Params, inputs: Inputs, scanner: Scanner, config: Config
 ) -> Gaussian:
     """Beliefs about the pose after each match: at the first step and then every period."""
+    if inputs.ranges is None:
+        raise ValueError("inputs.ranges: expected scans, got None")
     matcher = _matcher(config)
     std = params.block(MATCH_STD)
     controls = inputs.control.reshape(-1, matcher.period, inputs.control.shape[1])
