@@ -245,9 +245,14 @@ def drive():
     )
 
 
+@functools.cache
+def program(name):
+    scanner = CONFIG.scanner(SCENARIO.beam_angles())
+    return jax.jit(functools.partial(getattr(scan_filters, name), config=CONFIG, scanner=scanner))
+
+
 def filtered(name, inputs, **law):
-    one = functools.partial(getattr(scan_filters, name), config=CONFIG, scanner=CONFIG.scanner(SCENARIO.beam_angles()))
-    return jax.tree.map(np.asarray, jax.jit(one)(PARAMS, SCENARIO.prior(), inputs, **law))
+    return jax.tree.map(np.asarray, program(name)(PARAMS, SCENARIO.prior(), inputs, **law))
 
 
 @functools.cache
@@ -279,10 +284,23 @@ def test_a_filter_is_odometry_until_a_scan_tells_something(name, tolerance):
     assert np.abs(got.mean - np.asarray(truth.pose)[::5])[:, :2].max() < 0.05
 
 
-def test_a_table_has_a_row_for_each_covariance():
-    for name, laws in LAWS.items():
-        ways = [way for way in matching_compare._WAYS if way.filter == name]
-        assert [way.law for way in ways] == ([None] if laws is None else list(range(len(laws))))
+@pytest.mark.parametrize("name", ["on_occupancy", "on_lines"])
+def test_each_covariance_has_its_name_and_its_row(name):
+    """By how much the first match shrinks the belief; a number past the last would do the same as the last."""
+    names = LAWS[name]
+    assert [way.law for way in matching_compare._WAYS if way.filter == name] == list(range(len(names)))
+    volume = {}
+    for i, words in enumerate(names):
+        assert any(words in way.name and way.law == i for way in matching_compare._WAYS if way.filter == name)
+        cov = filtered(name, drive()[1], law=jnp.asarray(i, jnp.int32)).cov
+        volume[words.split(" (")[0]] = np.linalg.det(cov[1])
+    if name == "on_lines":
+        assert volume["sandwich × 30"] > 2 * volume["sandwich"]
+        assert volume["(JᵀJ)⁻¹ without σ²"] == max(volume.values()) > 2 * volume["σ² H⁻¹"]
+    else:
+        assert volume["H itself"] == max(volume.values())
+        assert volume["the optimiser's with its prior"] == min(volume.values())
+    assert len({round(np.log(v), 3) for v in volume.values()}) == len(names)
 
 
 # --- The program ---

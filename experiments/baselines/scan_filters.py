@@ -34,7 +34,7 @@ _RESPONSE_DROP = 0.1  # below the best response: what is less does not count
 _SMEAR = 0.03  # m
 _SHIFTS, _TURNS = (0.14, 15), (0.01745, 11)  # m, rad to either side, and how many
 _KEYFRAME = (1.0, 0.5)  # m, rad from the last one: then a new one
-_LEAST = 1e-6  # beside a matrix that may be singular, as a share of its trace
+_LEAST = 1e-6  # beside a matrix that may be singular, as a share of its diagonal
 
 
 class Scan(NamedTuple):
@@ -139,7 +139,7 @@ def response_moments(matched: Matched, response: Callable[[jax.Array], jax.Array
     return _measured(matched, _inverse(spread / jnp.maximum(best, _RESPONSE_DROP)))
 
 
-# What follows "the same" in a table.
+# What is taken for R, by the number that a filter is given.
 ON_OCCUPANCY = ("σ² H⁻¹", "H itself (Hector SLAM)", "the optimiser's with its prior (Cartographer 0.1)")
 ON_LINES = ("σ² H⁻¹", "sandwich", "sandwich × 30", "moments of the response (Karto)", "(JᵀJ)⁻¹ without σ²")
 _Choices = list[Callable[[], Told]]
@@ -254,16 +254,19 @@ def on_keyframes(params: Params, prior: Gaussian, inputs: Inputs, *, scanner: Sc
         belief = Gaussian(*information.update(*belief, H, told, pull, angles=(2, 5), poses=(0, POSE)))
         away, _, _ = between(belief.mean[POSE:], belief.mean[:POSE])
         new = ~keyframe.known | (jnp.hypot(away[0], away[1]) > _KEYFRAME[0]) | (jnp.abs(away[2]) > _KEYFRAME[1])
-        clone = jnp.tile(jnp.arange(POSE), 2)
-        cloned = Gaussian(belief.mean[clone], belief.cov[clone][:, clone])
-        return jax.tree.map(lambda a, b: jnp.where(new, a, b), (cloned, Keyframe(scan.points, new)), (belief, keyframe))
+        fresh = _cloned(belief), Keyframe(scan.points, new)
+        return jax.tree.map(lambda a, b: jnp.where(new, a, b), fresh, (belief, keyframe))
 
     beams = len(scanner.beam_angles)
     nothing = jnp.zeros((beams, 2), prior.mean.dtype)
     keyframe = Keyframe(Points(nothing, nothing, jnp.zeros(beams, bool)), jnp.array(False))
-    clone = jnp.tile(jnp.arange(POSE), 2)
-    prior = Gaussian(prior.mean[clone], prior.cov[clone][:, clone])
-    return _filtered(correct, prior, keyframe, params, inputs, scanner, config)
+    return _filtered(correct, _cloned(prior), keyframe, params, inputs, scanner, config)
+
+
+def _cloned(belief: Gaussian) -> Gaussian:
+    """The pose, and the pose once more."""
+    twice = jnp.tile(jnp.arange(POSE), 2)
+    return Gaussian(belief.mean[twice], belief.cov[twice][:, twice])
 
 
 def on_submaps(params: Params, prior: Gaussian, inputs: Inputs, *, scanner: Scanner, config: Config) -> Gaussian:
