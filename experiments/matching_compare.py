@@ -48,7 +48,7 @@ class MatchingConfig:
     out: Path = Path("out/matching_compare")
     """Folder for report.json and matching_compare.png."""
     quick: bool = False
-    """A run of a few seconds: four runs of 20 s."""
+    """A short run, most of which is compiling: four runs of 20 s, in the loop alone."""
 
 
 class Way(NamedTuple):
