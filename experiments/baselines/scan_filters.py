@@ -111,7 +111,7 @@ def unscaled(matched: Matched) -> Told:
 def response_moments(matched: Matched, response: Callable[[jax.Array], jax.Array]) -> Told:
     """R the second moments of the responses about the best pose, as Karto has them: over shifts at the best heading and
     over turns at the best place, of the responses less than 0.1 below the best, weighted by themselves, and the larger
-    the poorer the best one is.
+    the poorer the best one is (the turn's too, which Karto leaves as it is).
 
     Args:
         matched: as of the others.
