@@ -299,6 +299,26 @@ def test_precision_is_shown_by_kind_of_numbers_and_form(draw):
     assert figure.get_suptitle() == "fine\nfast"
 
 
+def test_filters_that_match_scans_are_compared_in_a_panel_for_each_world(draw):
+    def world(scale):
+        rows = [{"filter": name, "nees_per_match": (scale * RNG.uniform(1, 2, 4)).tolist()} for name in ("a", "b")]
+        return {"time_s": [1, 2, 3, 4], "nees_band_95": (2.0, 4.5), "filters": rows}
+
+    report = {"runs": 7, "worlds": {"loop": world(1), "hall": world(100)}}
+    figure = draw(plotting.matching_figure, report)
+    assert len(figure.axes) == 2
+    for ax, (name, each) in zip(figure.axes, report["worlds"].items(), strict=True):
+        for row in each["filters"]:
+            np.testing.assert_array_equal(line(ax, row["filter"]), [each["time_s"], row["nees_per_match"]])
+        assert band(ax, "95 % band, χ²(3·7)/7") == pytest.approx((2.0, 4.5))
+        np.testing.assert_array_equal(line(ax, "3: an honest covariance")[1], 3)
+        assert words(ax) == (name, "time [s]", "NEES after a match, mean of 7 runs [–]")
+        assert ax.get_yscale() == "log"
+        assert colour(ax, "b") != colour(ax, "a")
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()][-2:] == ["a", "b"]
+
+
 def sweep(anees, nis, rmse, consistent, misfit):
     cells = zip(*(np.ravel(x).tolist() for x in (anees, nis, rmse, misfit, consistent)), strict=True)
     names = ("anees", "nis_mean", "rmse_position_m", "misfit", "consistent")

@@ -1,7 +1,13 @@
 """Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. Nowhere else: matplotlib."""
 
 from jaxlocmap.plotting.maps import map_figure, trajectory_figure
-from jaxlocmap.plotting.studies import judge_figure, precision_figure, study_figure, sweep_figure
+from jaxlocmap.plotting.studies import (
+    judge_figure,
+    matching_figure,
+    precision_figure,
+    study_figure,
+    sweep_figure,
+)
 from jaxlocmap.plotting.tuning import (
     calibration_figure,
     descent_figure,
@@ -15,6 +21,7 @@ __all__ = [
     "judge_figure",
     "log_before_after_figure",
     "map_figure",
+    "matching_figure",
     "precision_figure",
     "study_before_after_figure",
     "study_figure",

@@ -146,6 +146,24 @@ def precision_figure(path: Path, rows: list[dict[str, Any]]) -> None:
     save(figure, path, dpi=120)
 
 
+def matching_figure(path: Path, report: dict[str, Any]) -> None:
+    """NEES over time of every filter, a panel for each world, as in the report of matching_compare.py."""
+    worlds, runs = report["worlds"], report["runs"]
+    figure = Figure(figsize=(7 * len(worlds) + 1, 7), layout="constrained")
+    axes = figure.subplots(1, len(worlds), squeeze=False)[0]
+    for ax, (name, world) in zip(axes, worlds.items(), strict=True):
+        low, high = world["nees_band_95"]
+        ax.axhspan(low, high, color=BAND, alpha=0.25, label=f"95 % band, χ²(3·{runs})/{runs}")
+        ax.axhline(3, color=TRUTH, ls="--", lw=1, label="3: an honest covariance")
+        for i, row in enumerate(world["filters"]):
+            last = i == len(world["filters"]) - 1
+            colour, width = ("black", 2.0) if last else (f"C{i % 10}", 1.0)
+            ax.plot(world["time_s"], row["nees_per_match"], color=colour, lw=width, label=row["filter"])
+        ax.set(title=name, xlabel="time [s]", ylabel=f"NEES after a match, mean of {runs} runs [–]", yscale="log")
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=9, loc="outside lower center", ncols=2)
+    save(figure, path, dpi=120)
+
+
 def sweep_figure(path: Path, report: dict[str, Any], labels: tuple[str, str], ticks: tuple[list[str], ...]) -> None:
     """ANEES and position RMSE of every cell of a sweep, the consistent ones outlined, as in the report of sweep.py.
 
