@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -45,7 +46,7 @@ _GAP = 0.8  # m: the ends of the course's 61 beams lie far apart
 # What a study can be resumed by.
 _SETTINGS = (
     *("scenario", "motion", "gate", "start", "map", "seed"),
-    *("steps", "own_noise", "exact_prior", "landmarks", "match", "match_every"),
+    *("steps", "own_noise", "odometry_noise", "scan_noise", "exact_prior", "landmarks", "match", "match_every"),
 )
 
 
@@ -74,6 +75,10 @@ class ConsistencyConfig:
     """The filter knows the start, to a millimetre and a milliradian."""
     landmarks: bool = True
     """The robot observes the landmarks."""
+    odometry_noise: float = 1.0
+    """How many times its usual errors the robot's odometry has."""
+    scan_noise: float = 0.03
+    """Standard deviation of a range of its scanner, m."""
     match: bool = False
     """Match scans on submaps."""
     match_every: int = 5
@@ -100,19 +105,20 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         scenario = dataclasses.replace(scenario, steps=config.steps)
     if config.exact_prior:
         scenario = dataclasses.replace(scenario, exact_prior=False, prior_std=_EXACT)
+    noise = robot_noise(config)
     if config.runs < 1:
         raise ValueError(f"runs: expected at least 1, got {config.runs}")
     runs = min(config.runs, 100) if config.quick else config.runs
     start(config.compute)
     settings = scenario.config(motion=config.motion, gate_probability=config.gate, grid=config.map)
-    world, noise, prior = scenario_world(scenario), simulation.Noise(), scenario.prior()
+    world, prior = scenario_world(scenario), scenario.prior()
     if not config.landmarks:
         world = world._replace(landmarks=world.landmarks[:0])
     own = simulation.own_params(noise, scenario)
     params = params_or(config.params, own if config.own_noise else simulation.course_params())
     if config.match:
         settings = dataclasses.replace(settings, matcher=Matcher(period=config.match_every, gap=_GAP))
-        params = with_defaults(params)
+        params = with_defaults(params, std=config.scan_noise)
     key = jax.random.key(config.seed)
     named = {name: getattr(config, name) for name in _SETTINGS}
     checkpoint = study_checkpoint(out, config.compute, named)
@@ -145,6 +151,16 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     return report
 
 
+def robot_noise(config: ConsistencyConfig) -> simulation.Noise:
+    """The errors of the simulated robot."""
+    for name in ("odometry_noise", "scan_noise"):
+        if not 0 < getattr(config, name) < math.inf:
+            raise ValueError(f"{name}: expected a finite number > 0, got {getattr(config, name)}")
+    usual, times = simulation.Noise(), config.odometry_noise
+    odometry = {"v": usual.v * times, "w": usual.w * times, "heading": usual.heading * times}
+    return usual._replace(**odometry, scan=config.scan_noise)
+
+
 def _reference(
     scenario: simulation.Scenario, settings: Config, config: ConsistencyConfig, world: World, runs: int
 ) -> Any:
@@ -154,7 +170,7 @@ def _reference(
     gated = config.gate is not None and len(world.landmarks) > 0
     if config.match or not (scenario.exact_prior or gated):
         return None
-    noise, count = simulation.Noise(), min(max(runs, _REFERENCE_RUNS[0]), _REFERENCE_RUNS[1])
+    noise, count = robot_noise(config), min(max(runs, _REFERENCE_RUNS[0]), _REFERENCE_RUNS[1])
     told, params = reference_study(scenario, settings, noise)
     key = jax.random.fold_in(jax.random.key(config.seed), 1)  # other drives, so that errors are independent
     devices = jax.local_devices()[: config.compute.devices]

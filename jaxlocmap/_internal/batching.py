@@ -204,4 +204,21 @@ def _add_zero(tree: Any, zero: jax.Array | None) -> Any:
     """
     if zero is None:
         return tree
-    return jax.tree.map(lambda x: jnp.logical_or(x, zero != 0) if x.dtype == bool else x + zero.astype(x.dtype), tree)
+
+    def differing(x: jax.Array) -> jax.Array:
+        if _differs_already(x):  # an addition would go through all of a map
+            return x
+        return jnp.logical_or(x, zero != 0) if x.dtype == bool else x + zero.astype(x.dtype)
+
+    return jax.tree.map(differing, tree)
+
+
+def _differs_already(x: jax.Array) -> bool:
+    """Whether a value may differ along all axes of `shard_map`: then it cannot be cast to one that does."""
+    for axis in jax.sharding.get_abstract_mesh().manual_axes:
+        try:
+            jax.lax.pcast(x, axis, to="varying")
+        except ValueError:
+            continue
+        return False
+    return True

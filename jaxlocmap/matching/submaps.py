@@ -279,16 +279,20 @@ def match_scan(
         lines = lines.at[jnp.where(cleared, slot, 2)].set(0, mode="drop", unique_indices=True)
     lines = lines.reshape(submaps.lines.shape)
 
-    # Add the scan to both.
+    # Add the scan to both, and read the map after that: a read in between would cost a copy of it.
     added = jnp.stack([accepted | anew, (accepted & active) | due])
     share = 1 - jnp.exp(-submaps.travel / length)
-    for place, entry, slot in ((0, older, which), (1, younger, 1 - which))[: matcher.maps]:
+    places = ((0, older, which), (1, younger, 1 - which))[: matcher.maps]
+    spec = matcher.spec
+    for place, entry, slot in places:
+        pose, _ = relative_pose(belief.mean, entry)
+        lines = line_grid.add_points(lines, pose, points, spec=spec, counts=added[place], at=slot)
+    for place, entry, slot in places:
         kappa = jnp.maximum(1 / (scans[place] + 1).astype(std.dtype), share)
         fresh = scans[place] == 0
         pose, H = relative_pose(belief.mean, entry)
-        lines = line_grid.add_points(lines, pose, points, spec=matcher.spec, counts=added[place], at=slot)
         rel = H @ belief.cov @ H.T
-        own = line_grid.fit(lines, pose, points, scale, spec=matcher.spec, at=slot).hessian / std**2
+        own = line_grid.fit(lines, pose, points, scale, spec=spec, at=slot).hessian / std**2
         told = jnp.where((place == 0) & ~fresh, 0, own)  # the older one was matched on: the belief knows already
         belief = _chosen(added[place], _moved_bias(belief, entry, kappa, H, rel, told), belief)
     scans = scans + added.astype(jnp.int32)
