@@ -143,7 +143,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         files = ["report.json", "nees.png"]
         if config.map:
             pictured = simulation.random_building(key) if drawn else world
-            _picture_of_one_run(out / "map.png", key, params, pictured, scenario, settings)
+            _picture_of_one_run(out / "map.png", key, params, pictured, noise, scenario, settings)
             files.append("map.png")
         _print(report)
         saved(out, *files)
@@ -180,11 +180,17 @@ def _reference(
 
 
 def _picture_of_one_run(
-    path: Path, key: jax.Array, params: Params, world: World, scenario: simulation.Scenario, settings: Any
+    path: Path,
+    key: jax.Array,
+    params: Params,
+    world: World,
+    noise: simulation.Noise,
+    scenario: simulation.Scenario,
+    settings: Any,
 ) -> None:
     """The map and path of one more run of the same study, started at the prior's mean."""
     prior = scenario.prior()
-    truth, inputs = simulation.simulate(key, world, simulation.Noise(), prior.mean, scenario=scenario)
+    truth, inputs = simulation.simulate(key, world, noise, prior.mean, scenario=scenario)
     state, beliefs = jax.jit(run, static_argnames=("config", "collect"))(
         params,
         init(prior, config=settings),

@@ -63,7 +63,7 @@ def handed_to_the_study(monkeypatch, program, config):
 
 CONSISTENCY = (
     *("scenario", "motion", "gate", "start", "map", "seed"),
-    *("steps", "own_noise", "exact_prior", "landmarks", "match", "match_every"),
+    *("steps", "own_noise", "odometry_noise", "scan_noise", "exact_prior", "landmarks", "match", "match_every"),
 )
 
 
@@ -91,6 +91,8 @@ CONSISTENCY = (
         ({"match": True}, {"period": 5, "blocks": 3}),
         ({"match": True, "match_every": 2}, {"period": 2, "blocks": 3}),
         ({"match_every": 2}, {}),
+        ({"odometry_noise": 3.0, "own_noise": True}, {"noise": {"v": 0.06, "w": 0.03, "heading": 0.015}, "own": True}),
+        ({"scan_noise": 0.06, "match": True}, {"noise": {"scan": 0.06}, "period": 5, "blocks": 3, "std": 0.06}),
     ],
     ids=str,
 )
@@ -117,11 +119,21 @@ def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
         "gate": study.config.gate_probability,
         "map": study.config.grid is not None,
         "seed": config.seed,
-    } == expected | fields
+    } == expected | {name: value for name, value in fields.items() if name not in ("noise", "std")}
     assert same_key(key, config.seed)
-    assert noise == simulation.Noise()
+    usual = simulation.Noise()._asdict() | fields.get("noise", {})
+    assert {**noise._asdict(), "blocks": 0} == pytest.approx({**usual, "blocks": 0})
+    if config.match:
+        assert float(params.blocks["match_std"]) == pytest.approx(fields.get("std", 0.03))
     np.testing.assert_allclose(prior.mean, study.scenario.start, rtol=1e-6)
     assert named == {name: getattr(config, name) for name in CONSISTENCY}
+
+
+@pytest.mark.parametrize("options", [{"odometry_noise": 0.0}, {"odometry_noise": math.inf}, {"scan_noise": -0.1}])
+def test_noise_that_is_none_is_refused(tmp_path, options):
+    (name,) = options
+    with pytest.raises(ValueError, match=f"^{name}: expected a finite number > 0"):
+        consistency.main(consistency.ConsistencyConfig(**options, out=tmp_path))
 
 
 def test_parameters_of_consistency(monkeypatch, tmp_path, plant):
@@ -149,7 +161,8 @@ def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
     assert (totals, settings.gate_probability, settings.motion, told) == ("totals", 0.9, "euler", "reference")
     ((scenario, same, given, _, runs), _) = reference_of.calls[0]
     assert (scenario.exact_prior, same, given, runs) == (True, settings, config, 50)
-    ((path, key, params, _, drawn, how), _) = pictured.calls[0]
+    ((path, key, params, _, noise, drawn, how), _) = pictured.calls[0]
+    assert noise == simulation.Noise()
     assert (path, drawn, how) == (tmp_path / "map.png", scenario, settings)
     assert same_key(key, 6)
     np.testing.assert_allclose(params.R, plant[1].R, rtol=1e-6)
@@ -239,7 +252,10 @@ def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     monkeypatch.setattr(consistency.plotting, "map_figure", figure := Recorder())
     key = jax.random.key(6)
     room = simulation.room()
-    consistency._picture_of_one_run(tmp_path / "a.png", key, simulation.course_params(), room, scenario, settings)
+    noise = simulation.Noise()
+    consistency._picture_of_one_run(
+        tmp_path / "a.png", key, simulation.course_params(), room, noise, scenario, settings
+    )
     ((given, world, noise, start), how) = drove.calls[0]
     assert same_key(given, 6)
     assert (noise, how) == (simulation.Noise(), {"scenario": scenario})

@@ -182,7 +182,7 @@ def test_a_log_without_odometry_and_clocks_that_differ_are_refused(tmp_path):
     with pytest.raises(ValueError, match="expected laser scans with odometry"):
         program(tmp_path / "out", raw)
     relations = write(tmp_path / "a.relations", "1 2 0 0 0 0 0 0\n")
-    with pytest.raises(ValueError, match="relations: expected pairs of stamps of the log, 10.000 to 69.000 s"):
+    with pytest.raises(ValueError, match=r"relations: expected pairs of stamps of the log, 10\.000 to 69\.000 s"):
         program(tmp_path / "out", log_file(tmp_path), relations=relations)
 
 
