@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any
 
 import consistency
 import localize
+import slam
 from common import CONSOLE, command_line, output_folder, replace_table
 
-from jaxlocmap import simulation
+from jaxlocmap import files, simulation
 from jaxlocmap.consistency import readable
+from jaxlocmap.logs import write_tum
 
 _STUDIES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("the course's noise, exact arc (the default)", "", {}),
@@ -34,6 +37,20 @@ _WOODS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--motion euler --max-range 5 --gate None", {"max_range": 5.0, "gate": None}),
     ("--motion euler --max-range 1.5", {"max_range": 1.5}),
 )
+_LOOP = {"scenario": "loop", "steps": 2400}
+_MATCHES: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("loop, 4 laps", "--scenario loop --steps 2400", _LOOP),
+    ("the same, start known to 0.14 rad", "", _LOOP | {"exact_prior": False}),
+    ("the same, wheels 3 times as bad", "--odometry-noise 3", _LOOP | {"odometry_noise": 3.0}),
+    ("the same, ranges to 1 cm", "--scan-noise 0.01", _LOOP | {"scan_noise": 0.01}),
+    ("the same, ranges to 6 cm", "--scan-noise 0.06", _LOOP | {"scan_noise": 0.06}),
+    ("the same, a match every step", "--match-every 1", _LOOP | {"match_every": 1}),
+    ("the same, every 10th", "--match-every 10", _LOOP | {"match_every": 10}),
+    ("building, 3 rounds", "--scenario building", {"scenario": "building"}),
+    ("the same, wheels 3 times as bad", "--odometry-noise 3", {"scenario": "building", "odometry_noise": 3.0}),
+    ("the same, a match every 10th step", "--match-every 10", {"scenario": "building", "match_every": 10}),
+)
+_QUICK_STEPS = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,9 +58,11 @@ class TablesConfig:
     """What to run."""
 
     data: Path | None = None
-    """Folder with lost_in_the_woods/ and mrclam/; without it the table of real logs is left out."""
+    """Folder with lost_in_the_woods/, mrclam/ and carmen/; without it the tables of real logs are left out."""
     runs: int = 2000
     """Runs of each study."""
+    match_runs: int = 200
+    """Runs of each study of a filter that matches scans."""
     write: bool = False
     """Put the tables into the README instead of printing them."""
     seed: int = 0
@@ -51,15 +70,16 @@ class TablesConfig:
     out: Path = Path("out/readme_tables")
     """Folder for the reports behind the tables, and plant.json."""
     quick: bool = False
-    """Studies of 100 runs, and the first 2,000 steps of each log."""
+    """Studies of 100 runs, one of 8 short runs of matching, and the beginning of each log."""
 
 
 def main(config: TablesConfig) -> dict[str, str]:
     """Run, and return the tables by name."""
     out = output_folder(config.out)
-    tables = {"studies": _studies(config, out)}
+    tables = {"studies": _studies(config, out), "matches": _matches(config, out)}
     if config.data is not None:
         tables["logs"] = _logs(config, config.data, out)
+        tables["slam"] = _slam(config, config.data, out)
     for name, table in tables.items():
         if config.write:
             replace_table(name, table)
@@ -86,6 +106,70 @@ def _studies(config: TablesConfig, out: Path) -> str:
             f"{100 * report['gate_accept_rate']:.2f} % | {_short(report['verdict'])} |".replace("``", "–")
         )
     return "\n".join(rows)
+
+
+def _matches(config: TablesConfig, out: Path) -> str:
+    """Of filters that see no landmark, told the robot's own noise, which start from a pose that is known."""
+    heads = ("position RMSE", "ANEES (3)", "on the submap (3)", "submap to submap (3)", "let in", "diverged")
+    rows = [f"| drives | arguments | {' | '.join(heads)} |", "|---" * 8 + "|"]
+    for i, (what, arguments, settings) in enumerate(_MATCHES[:1] if config.quick else _MATCHES):
+        chosen: dict[str, Any] = {"exact_prior": True, **settings} | ({"steps": _QUICK_STEPS} if config.quick else {})
+        report = consistency.main(
+            consistency.ConsistencyConfig(
+                **chosen,
+                motion="euler",
+                match=True,
+                landmarks=False,
+                own_noise=True,
+                map=False,
+                runs=8 if config.quick else config.match_runs,
+                seed=config.seed,
+                out=out / f"match{i}",
+            )
+        )
+        rows.append(
+            f"| {what} | `{arguments}` | {report['rmse_position_m']:.3f} m | {readable(report['anees'])} | "
+            f"{readable(report['relative_anees'])} | {readable(report['edge_anees'])} | "
+            f"{100 * report['match_accept_rate']:.1f} % | {report['diverged_runs']} |".replace("``", "–")
+        )
+    return "\n".join(rows)
+
+
+def _slam(config: TablesConfig, data: Path, out: Path) -> str:
+    rows = ["| log | scored by | pairs | translation, median | rotation, median | let in | a scan |", "|---" * 7 + "|"]
+    carmen = data / "carmen"
+    reference = corrected(carmen / "raw_odom" / "csail_corrected_log.json.gz", out)
+    scorings: tuple[tuple[str, str, dict[str, Any]], ...] = (
+        ("Intel", "relations", {"relations": carmen / "relations" / "intel.relations"}),
+        ("CSAIL", "revisits", {"reference": reference}),
+    )
+    for name, by, scored in scorings:
+        report = slam.main(
+            slam.SlamConfig(
+                log=carmen / f"{name.lower()}-raw.log.gz",
+                format="carmen",
+                quick=config.quick,
+                out=out / f"slam_{name.lower()}",
+                **scored,
+            )
+        )
+        score = report[by]
+        rows.append(
+            f"| {name} | {by} | {score['scored']} "
+            f"| {score['translation_m']:.3f} m, {score['translation_median_m']:.3f} m "
+            f"| {score['rotation_deg']:.2f}°, {score['rotation_median_deg']:.2f}° "
+            f"| {100 * report['matched'] / max(report['tried'], 1):.1f} % | {report['ms_per_scan']:.1f} ms |"
+        )
+    return "\n".join(rows)
+
+
+def corrected(path: Path, out: Path) -> Path:
+    """Corrected poses of a log, as TUM file: JSON, {"map": {stamp: {"x": m, "y": m, "theta": rad}}}."""
+    poses = json.loads(files.unzipped(path, files.read(path)))["map"]
+    stamps = sorted(poses, key=float)
+    table = [[poses[stamp][name] for name in ("x", "y", "theta")] for stamp in stamps]
+    write_tum(out / "reference.tum", [float(stamp) for stamp in stamps], table)
+    return out / "reference.tum"
 
 
 def _logs(config: TablesConfig, data: Path, out: Path) -> str:

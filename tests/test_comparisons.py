@@ -1,5 +1,7 @@
 """The programs behind the README's tables: what they run, what they take of it, and every cell they print."""
 
+import gzip
+import json
 import math
 import sys
 from pathlib import Path
@@ -13,6 +15,7 @@ from programs import Recorder, stop
 from scipy.stats import chi2
 
 from jaxlocmap import Config, Gaussian, Params, simulation, tuning
+from jaxlocmap.logs import read_trajectory
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import readme_tables
@@ -586,6 +589,60 @@ def test_the_studies_of_the_readme(monkeypatch, tmp_path, quick):
         assert row[2:] == ["3.46", "1.12, 0.99, 2.00", "2.35", "98.77 %", readme_tables._short(STUDY["verdict"])]
 
 
+MATCHES = {
+    "rmse_position_m": 0.12345,
+    "anees": 2.345,
+    "relative_anees": 1.234,
+    "edge_anees": 3.456,
+    "match_accept_rate": 0.98765,
+    "diverged_runs": 1,
+}
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_studies_of_matching_of_the_readme(monkeypatch, tmp_path, quick):
+    monkeypatch.setattr(readme_tables.consistency, "main", ran := Recorder(MATCHES))
+    config = readme_tables.TablesConfig(match_runs=70, seed=4, quick=quick)
+    rows = rows_of(readme_tables._matches(config, tmp_path))
+    configs = [args[0] for args, _ in ran.calls]
+    assert {(c.runs, c.map, c.seed, c.match, c.landmarks, c.own_noise) for c in configs} == {
+        (8 if quick else 70, False, 4, True, False, True)
+    }
+    assert len({c.out for c in configs}) == len(rows) == (1 if quick else 10)
+    assert rows[0][2:] == ["0.123 m", "2.35", "1.23", "3.46", "98.8 %", "1"]
+    assert [c.exact_prior for c in configs[:2]] == ([True] if quick else [True, False])
+    # What stands beside a study is what it was called with, but for what it says of the one before.
+    for row, c in zip(rows, configs, strict=True):
+        options = [f"--odometry-noise {c.odometry_noise:g}"] * (c.odometry_noise != 1)
+        options += [f"--scan-noise {c.scan_noise:g}"] * (c.scan_noise != 0.03)
+        options += [f"--match-every {c.match_every}"] * (c.match_every != 5)
+        said = row[1].strip("`–")
+        steps = f" --steps {c.steps}" if c.steps and not quick else " --steps 2400" if quick else ""
+        assert said == (" ".join(options) if row[0].startswith("the same") else f"--scenario {c.scenario}{steps}")
+
+
+def test_the_matched_logs_of_the_readme(monkeypatch, tmp_path):
+    score = {"scored": 9, "translation_m": 0.1234, "translation_median_m": 0.05}
+    score |= {"rotation_deg": 1.234, "rotation_median_deg": 0.5}
+    report = {"relations": score, "revisits": score | {"scored": 7}, "matched": 99, "tried": 100, "ms_per_scan": 1.26}
+    monkeypatch.setattr(readme_tables.slam, "main", ran := Recorder(report))
+    folder = tmp_path / "carmen" / "raw_odom"
+    folder.mkdir(parents=True)
+    poses = {"12.5": {"x": 1.0, "y": 2.0, "theta": 0.5, "range": []}, "9.5": {"x": 0.0, "y": 0.0, "theta": 0.0}}
+    text = json.dumps({"map": poses}).encode()
+    (folder / "csail_corrected_log.json.gz").write_bytes(gzip.compress(text))
+    rows = rows_of(readme_tables._slam(readme_tables.TablesConfig(quick=True), tmp_path, tmp_path))
+    intel, csail = (args[0] for args, _ in ran.calls)
+    assert intel.quick
+    assert (intel.log.name, intel.relations.name, intel.reference) == ("intel-raw.log.gz", "intel.relations", None)
+    assert (csail.log.name, csail.relations, csail.reference) == ("csail-raw.log.gz", None, tmp_path / "reference.tum")
+    assert rows[0] == ["Intel", "relations", "9", "0.123 m, 0.050 m", "1.23°, 0.50°", "99.0 %", "1.3 ms"]
+    assert rows[1][:3] == ["CSAIL", "revisits", "7"]
+    read = read_trajectory(csail.reference)
+    np.testing.assert_allclose(read.time, [9.5, 12.5])
+    np.testing.assert_allclose(read.pose, [[0, 0, 0], [1, 2, 0.5]])
+
+
 def test_the_logs_of_the_readme(monkeypatch, tmp_path):
     log = {"rmse_position_m": 0.12345, "anees": 4.5, "gate_accept_rate": 0.987, "verdict": "so: it is (x)"}
     monkeypatch.setattr(readme_tables.localize, "main", ran := Recorder(log | {"gate_verdict": "fine; yet"}))
@@ -614,11 +671,12 @@ def test_the_logs_of_the_readme(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize(("data", "write"), [(None, False), (None, True), (Path("d"), True)])
 def test_tables_are_written_where_that_is_asked_for(monkeypatch, tmp_path, data, write):
-    monkeypatch.setattr(readme_tables, "_studies", Recorder("studies' table"))
-    monkeypatch.setattr(readme_tables, "_logs", Recorder("logs' table"))
+    for name in ("studies", "matches", "logs", "slam"):
+        monkeypatch.setattr(readme_tables, f"_{name}", Recorder(f"{name}' table"))
     monkeypatch.setattr(readme_tables, "replace_table", replaced := Recorder())
     tables = readme_tables.main(readme_tables.TablesConfig(data=data, write=write, out=tmp_path))
-    expected = {"studies": "studies' table"} | ({"logs": "logs' table"} if data else {})
+    names = ("studies", "matches", "logs", "slam") if data else ("studies", "matches")
+    expected = {name: f"{name}' table" for name in names}
     assert tables == expected
     assert [args for args, _ in replaced.calls] == (list(expected.items()) if write else [])
 
