@@ -7,7 +7,7 @@ from jaxlocmap.motion import MotionModel
 from jaxlocmap.parameters import Block, Params
 from jaxlocmap.pipeline import init, map_scans, run, step
 from jaxlocmap.sensors import Sensor
-from jaxlocmap.types import Config, Gaussian, GridSpec, Info, Inputs, Scanner, State, Truth
+from jaxlocmap.types import Config, Gaussian, GridSpec, Info, Inputs, Matcher, Scanner, State, Truth
 
 __all__ = [
     "Block",
@@ -16,6 +16,7 @@ __all__ = [
     "GridSpec",
     "Info",
     "Inputs",
+    "Matcher",
     "MotionModel",
     "Params",
     "Scanner",
