@@ -39,7 +39,6 @@ _OLDER = POSE  # entry of the state at which the anchor of the map begins
 _START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
 _KNOWN_STD = (0.02, 0.005)  # m, rad: errors of a known map
 _STREAK = 3  # scans in a row that are refused: worth a word
-_LEAST_SHARE = 0.5  # of a scan's points: with fewer, a wall that was never seen passes for another
 _MANY = 0.2  # of the scans: if more are refused, something is wrong
 
 
@@ -165,7 +164,6 @@ def settings_of(config: SlamConfig, log: Log, known: LoadedLines | None) -> Conf
         resolution=0.1 if known is None else known.resolution,
         half_width=config.half_width if known is None else known.half_width,
         steps=20,
-        least_share=_LEAST_SHARE,
         window=config.window,
         known_std=None if known is None else _KNOWN_STD,
     )
