@@ -39,6 +39,7 @@ _OLDER = POSE  # entry of the state at which the anchor of the map begins
 _START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
 _KNOWN_STD = (0.02, 0.005)  # m, rad: errors of a known map
 _STREAK = 3  # scans in a row that are refused: worth a word
+_LEAST_SHARE = (0.2, 0.5)  # of a scan's points, on a map that grows and on a known one, which has every room
 _MANY = 0.2  # of the scans: if more are refused, something is wrong
 
 
@@ -165,6 +166,7 @@ def settings_of(config: SlamConfig, log: Log, known: LoadedLines | None) -> Conf
         half_width=config.half_width if known is None else known.half_width,
         steps=20,
         window=config.window,
+        least_share=_LEAST_SHARE[known is not None],
         known_std=None if known is None else _KNOWN_STD,
     )
     return Config(
@@ -205,7 +207,7 @@ def match_log(
     std = jnp.array(_START_STD if known else (0.0, 0.0, 0.0))
     state = init(Gaussian(jnp.array(start), jnp.diag(std**2)), config=config)
     if known is not None and config.matcher is not None:
-        state = state._replace(submaps=submaps.known(jnp.asarray(known.lines), config.matcher, np.dtype(np.float32)))
+        state = state._replace(submaps=submaps.known(jnp.asarray(known.lines), config.matcher, state.belief.mean.dtype))
     began = time.perf_counter()
     first = jax.tree.map(lambda x: x[:_PIECE], inputs)
     program = _piece.lower(params, state, first, angles, config=config).compile()

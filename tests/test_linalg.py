@@ -171,8 +171,17 @@ def test_roundings_add_up_in_a_large_matrix(tolerance):
     """A pose and its clone, corrected time and again: a correlation of one, off by a thousand roundings."""
     rounding, beyond = tolerance(1e3 * 2.0**-52, 1e3 * 2.0**-23), tolerance(1e-11, 1e-2)
     for excess, fine in ((-beyond, True), (0, True), (rounding, True), (beyond, False)):
-        P = np.diag([4e-12, *np.ones(14)])
-        P[0, 7] = P[7, 0] = 2e-6 * (1 + excess)
+        P = np.diag([4.0, *np.ones(14)])
+        P[0, 7] = P[7, 0] = 2 * (1 + excess)
+        assert psd(P) is fine
+
+
+def test_what_the_largest_variance_leaves_of_a_variance_of_zero_is_rounding(tolerance):
+    """Of a clone of a pose that is known exactly, beside poses that are not."""
+    rounding, beyond = tolerance(2.0**-52, 2.0**-23), tolerance(1e-6, 1e-2)
+    for size, fine in ((rounding, True), (beyond, False)):
+        P = np.diag([size**2 / 2, *np.ones(14)])
+        P[0, 7] = P[7, 0] = size
         assert psd(P) is fine
 
 

@@ -174,7 +174,7 @@ def test_off_a_straight_wall_the_residual_is_the_distance(heading, tolerance):
         used = np.asarray(got.used)
         assert used[3:-3].all()
         np.testing.assert_allclose(got.residual[used], off, rtol=0, atol=tolerance(1e-12, 1e-5))
-        weight = 1 / (1 + (off / SCALE) ** 2)
+        weight = (1 - (off / lines.REACH) ** 2) / (1 + (off / SCALE) ** 2)
         np.testing.assert_allclose(got.weight[used], weight, rtol=tolerance(1e-9, 1e-4))
         # Along the wall nothing is known; the residual changes by 1 m a metre ahead.
         along = np.array([-np.sin(heading), np.cos(heading), 0.0])
@@ -342,4 +342,4 @@ def test_points_are_counted_as_a_fit_weighs_them_where_cells_are_read_at_their_c
     got = lines.overlap(drawn, jnp.zeros(2), there, jnp.asarray(SCALE), spec=SPEC)
     expected = fit(drawn, jnp.zeros(3), points, jnp.asarray(SCALE))
     np.testing.assert_allclose(got, expected.weight.sum(), rtol=tolerance(1e-9, 1e-4))
-    assert float(got) == pytest.approx(n / (1 + (0.03 / SCALE) ** 2), rel=1e-4)
+    assert float(got) == pytest.approx(n * (1 - 0.01) / (1 + (0.03 / SCALE) ** 2), rel=1e-4)

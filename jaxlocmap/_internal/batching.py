@@ -182,7 +182,9 @@ def cond(
     def branch(function: Callable[..., Any]) -> Callable[[list[Any]], list[Any]]:
         def run(scalars: list[Any]) -> list[Any]:
             result = function(*stack(scalars))
-            scalars, stack_result = unstack(_add_zero(result, zero))
+            if zero is not None:  # an addition would go through all of a map: only where it is needed
+                result = jax.tree.map(lambda x: x if _differs_already(x) else _add_zero(x, zero), result)
+            scalars, stack_result = unstack(result)
             outputs.append(stack_result)
             return scalars
 
@@ -204,13 +206,7 @@ def _add_zero(tree: Any, zero: jax.Array | None) -> Any:
     """
     if zero is None:
         return tree
-
-    def differing(x: jax.Array) -> jax.Array:
-        if _differs_already(x):  # an addition would go through all of a map
-            return x
-        return jnp.logical_or(x, zero != 0) if x.dtype == bool else x + zero.astype(x.dtype)
-
-    return jax.tree.map(differing, tree)
+    return jax.tree.map(lambda x: jnp.logical_or(x, zero != 0) if x.dtype == bool else x + zero.astype(x.dtype), tree)
 
 
 def _differs_already(x: jax.Array) -> bool:

@@ -204,12 +204,14 @@ def is_psd(P: jax.Array) -> jax.Array:
 
     P plus a few roundings of its diagonal has no negative pivot, so that the answer does not depend on units. A pivot
     of zero is one only if what remains of its row is zero too. In a large matrix, a product of larger ones, roundings
-    add up.
+    add up, and those of its largest entries may be all there is of its smallest.
     """
     n = len(P)
     if n > SMALL:
-        lifted = mirrored(P) + jnp.diag(jnp.diagonal(P) * n**2 * _rounding(P.dtype) + jnp.finfo(P.dtype).tiny)
-        return jnp.all(jnp.diagonal(P) >= 0) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(lifted)))
+        variance = jnp.diagonal(P)
+        lift = variance * _rounding(P.dtype) + jnp.max(variance) * jnp.finfo(P.dtype).eps
+        lifted = mirrored(P) + jnp.diag(n**2 * lift + jnp.finfo(P.dtype).tiny)
+        return jnp.all(variance >= 0) & jnp.all(jnp.isfinite(jnp.linalg.cholesky(lifted)))
     S = Matrix.symmetric(P)
     lift = 1 + _rounding(P.dtype)
     rows = [[S[i, j] * lift if i == j else S[i, j] for j in range(n)] for i in range(n)]

@@ -85,7 +85,8 @@ def fit(
 ) -> Fit:
     """How far the points of a scan lie off the lines of the map, and how that changes with the pose.
 
-        r = mᵀ (A q - b) / (mᵀ A m),  J = mᵀ A [I, (R p)^⊥] / (mᵀ A m),  w = (mᵀ A m / W) / (1 + (r / scale)²)
+        r = mᵀ (A q - b) / (mᵀ A m),  J = mᵀ A [I, (R p)^⊥] / (mᵀ A m)
+        w = (mᵀ A m / W) (1 - (r / REACH)²) / (1 + (r / scale)²)
 
     q is the point in the map's frame, m its normal there, and the sums are read between the centres of four cells, each
     about its own centre. A m points along the map's own normal, an average over many points. The normal of one point is
@@ -96,6 +97,8 @@ def fit(
     Args:
         lines, pose, points, spec, at: as of `add_points`.
         scale: () m, of the Cauchy weight: a point that far off its line counts half.
+
+    The weight fades to nothing at `REACH`, so that a point that leaves its line makes no jump.
 
     Source: Biber & Strasser 2003 (a grid of local surfaces); Censi 2008 (point to line); the weight Cauchy's.
 
@@ -126,8 +129,7 @@ def fit(
     residual = (normal_x * off_x + normal_y * off_y) * per_agree
     used = known & (jnp.abs(residual) < REACH)
     residual = jnp.where(used, residual, 0)
-    robust = (1 - (residual / REACH) ** 2) / (1 + (residual / scale) ** 2)
-    share = jnp.where(used, agree / jnp.where(used, weight, 1) * robust, 0)
+    share = jnp.where(used, agree / jnp.where(used, weight, 1) * _robust(residual, scale), 0)
     J_x, J_y = along_x * per_agree, along_y * per_agree
     J = J_x, J_y, J_y * arm_x - J_x * arm_y
     hessian = [[jnp.sum(share * J[min(i, j)] * J[max(i, j)]) for j in range(POSE)] for i in range(POSE)]
@@ -167,7 +169,12 @@ def overlap(
     known = turned.valid & inside & (weight > _LEAST_WEIGHT) & (agree > _LEAST_AGREEMENT * weight)
     off = n_x * (xx * dx + xy * dy - b_x) + n_y * (xy * dx + yy * dy - b_y)
     residual = off / jnp.where(known, agree, 1)
-    return jnp.sum(jnp.where(known, agree / jnp.where(known, weight, 1) / (1 + (residual / scale) ** 2), 0))
+    return jnp.sum(jnp.where(known, agree / jnp.where(known, weight, 1) * _robust(residual, scale), 0))
+
+
+def _robust(residual: jax.Array, scale: jax.Array) -> jax.Array:
+    """The weight of a point by its distance from its line."""
+    return jnp.maximum(1 - (residual / REACH) ** 2, 0) / (1 + (residual / scale) ** 2)
 
 
 class Placed(NamedTuple):
