@@ -109,6 +109,7 @@ def test_a_soft_gate_corrects_by_the_weight_of_a_match_and_maps_by_its_decision(
             belief,
             state.submaps,
             ranges,
+            before=state.belief.mean,
             scanner=scanner,
             matcher=MATCHER,
             angles=(2, 5, 8, 11, 14),

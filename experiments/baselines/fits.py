@@ -82,8 +82,9 @@ def on_lines(lines: jax.Array, pose: jax.Array, points: Points, scale: jax.Array
         lines, pose, points, scale, spec: as there.
     """
     found = line_grid.fit(lines, pose, points, scale, spec=spec)
-    _, _, n_x, n_y, arm_x, arm_y, _ = line_grid.placed(pose, points)
-    return Fit(found.residual, jnp.stack([n_x, n_y, n_y * arm_x - n_x * arm_y], axis=1), found.weight)
+    at = line_grid.placed(pose, points)
+    x, y = found.direction[:, 0], found.direction[:, 1]
+    return Fit(found.residual, jnp.stack([x, y, y * at.arm_x - x * at.arm_y], axis=1), found.weight)
 
 
 def on_scan(reference: Points, pose: jax.Array, points: Points, scale: jax.Array) -> Fit:

@@ -35,6 +35,7 @@ class Fit(NamedTuple):
     hessian: jax.Array  # (3, 3) 1, 1, m^2 on the diagonal: sum of w J' J, J the derivative of a residual by the pose
     slope: jax.Array  # (3,) m, m, m^2: sum of w J' r
     residual: jax.Array  # (B,) m, distance of each point from its line; 0 where not used
+    direction: jax.Array  # (B, 2) derivative of each by the place of its point: along the normal of the map
     used: jax.Array  # (B,) bool: the point has a line
     weight: jax.Array  # (B,) share of each point that counts; 0 where not used
 
@@ -134,7 +135,7 @@ def fit(
     J = J_x, J_y, J_y * arm_x - J_x * arm_y
     hessian = [[jnp.sum(share * J[min(i, j)] * J[max(i, j)]) for j in range(POSE)] for i in range(POSE)]
     slope = jnp.stack([jnp.sum(share * Ji * residual) for Ji in J])
-    return Fit(stack_scalars(hessian), slope, residual, used, share)
+    return Fit(stack_scalars(hessian), slope, residual, jnp.stack([J_x, J_y], axis=-1), used, share)
 
 
 def overlap(
