@@ -46,7 +46,17 @@ _GAP = 0.8  # m: the ends of the course's 61 beams lie far apart
 # What a study can be resumed by.
 _SETTINGS = (
     *("scenario", "motion", "gate", "start", "map", "seed"),
-    *("steps", "own_noise", "odometry_noise", "scan_noise", "exact_prior", "landmarks", "match", "match_every"),
+    *(
+        "steps",
+        "own_noise",
+        "odometry_noise",
+        "beams",
+        "scan_noise",
+        "exact_prior",
+        "landmarks",
+        "match",
+        "match_every",
+    ),
 )
 
 
@@ -77,6 +87,8 @@ class ConsistencyConfig:
     """The robot observes the landmarks."""
     odometry_noise: float = 1.0
     """How many times its usual errors the robot's odometry has."""
+    beams: int = 61
+    """How many its scanner has, over 137 degrees."""
     scan_noise: float = 0.03
     """Standard deviation of a range of its scanner, m."""
     match: bool = False
@@ -103,6 +115,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         scenario = dataclasses.replace(scenario, exact_prior=config.start == "exact")
     if config.steps is not None:
         scenario = dataclasses.replace(scenario, steps=config.steps)
+    scenario = dataclasses.replace(scenario, beams=config.beams)
     if config.exact_prior:
         scenario = dataclasses.replace(scenario, exact_prior=False, prior_std=_EXACT)
     noise = robot_noise(config)

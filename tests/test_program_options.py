@@ -63,7 +63,17 @@ def handed_to_the_study(monkeypatch, program, config):
 
 CONSISTENCY = (
     *("scenario", "motion", "gate", "start", "map", "seed"),
-    *("steps", "own_noise", "odometry_noise", "scan_noise", "exact_prior", "landmarks", "match", "match_every"),
+    *(
+        "steps",
+        "own_noise",
+        "odometry_noise",
+        "beams",
+        "scan_noise",
+        "exact_prior",
+        "landmarks",
+        "match",
+        "match_every",
+    ),
 )
 
 
@@ -92,6 +102,7 @@ CONSISTENCY = (
         ({"match": True, "match_every": 2}, {"period": 2, "blocks": 3}),
         ({"match_every": 2}, {}),
         ({"odometry_noise": 3.0, "own_noise": True}, {"noise": {"v": 0.06, "w": 0.03, "heading": 0.015}, "own": True}),
+        ({"beams": 181}, {"beams": 181}),
         ({"scan_noise": 0.06, "match": True}, {"noise": {"scan": 0.06}, "period": 5, "blocks": 3, "std": 0.06}),
     ],
     ids=str,
@@ -101,11 +112,12 @@ def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
     (study, key, runs, params, world, noise, prior), named = handed_to_the_study(monkeypatch, consistency, config)
     expected = {"name": "capstone", "exact": True, "motion": "arc", "runs": 2000, "gate": 0.99, "map": True, "seed": 0}
     expected |= {"steps": 1200 if study.scenario.name == "loop" else 240, "landmarks": 4, "walls": 8, "own": False}
-    expected |= {"period": None, "blocks": 0, "prior_std": simulation.CAPSTONE.prior_std}
+    expected |= {"beams": 61, "period": None, "blocks": 0, "prior_std": simulation.CAPSTONE.prior_std}
     course, own = simulation.course_params(), simulation.own_params(noise, study.scenario)
     assert isinstance(study, RandomBuildings) == (config.scenario == "random_building")
     assert {
         "steps": study.scenario.steps,
+        "beams": study.scenario.beams,
         "prior_std": study.scenario.prior_std,
         "landmarks": len(world.landmarks),
         "walls": len(world.segments),
