@@ -221,6 +221,28 @@ def progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
         yield lambda done: bar.update(task, completed=done)
 
 
+def in_pieces(
+    turn: Callable[[Any, Any], tuple[Any, Any]], state: Any, inputs: Any, steps: int, size: int, what: str
+) -> tuple[Any, Any]:
+    """A scan over time in equal pieces, so that a bar can move.
+
+    Args:
+        turn: (state, inputs of a piece) -> (state, what it reports of each step).
+        inputs: of all steps and those that fill up the last piece.
+        steps: how many count.
+
+    Returns:
+        The last state, and the reports of the steps that count, as NumPy arrays.
+    """
+    reports = []
+    with progress_bar(what, steps) as progress:
+        for begin in range(0, steps, size):
+            state, report = turn(state, jax.tree.map(lambda x, begin=begin: x[begin : begin + size], inputs))
+            reports.append(jax.tree.map(np.asarray, report))
+            progress(min(begin + size, steps))
+    return state, jax.tree.map(lambda *pieces: np.concatenate(pieces)[:steps], *reports)
+
+
 def write_report(folder: Path, report: dict[str, Any]) -> None:
     """`report.json`; a number that is not finite becomes null, which is what JSON has for it."""
     files.write(folder / "report.json", json.dumps(_plain(report), indent=1, allow_nan=False) + "\n")

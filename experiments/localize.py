@@ -18,9 +18,9 @@ from common import (
     check_gate,
     command_line,
     count_rows,
+    in_pieces,
     output_folder,
     params_or,
-    progress_bar,
     saved,
     show,
     write_report,
@@ -173,14 +173,12 @@ def filter_log(params: Params, prior: Gaussian, inputs: Inputs, landmarks: np.nd
     steps = len(inputs.dt)
     fill = -steps % _PIECE
     padded = jax.tree.map(lambda x: np.concatenate([x, np.zeros((fill, *x.shape[1:]), x.dtype)]), inputs)
-    state, reports = init(prior, config=config), []
-    with progress_bar("filtering", steps) as progress:
-        for begin in range(0, steps, _PIECE):
-            piece = jax.tree.map(lambda x, begin=begin: x[begin : begin + _PIECE], padded)
-            state, info = _piece(params, state, piece, landmarks, config=config)
-            reports.append(jax.tree.map(np.asarray, info))
-            progress(min(begin + _PIECE, steps))
-    return jax.tree.map(lambda *pieces: np.concatenate(pieces)[:steps], *reports)
+
+    def turn(state: State, piece: Inputs) -> tuple[State, Info]:
+        return _piece(params, state, piece, landmarks, config=config)
+
+    _, info = in_pieces(turn, init(prior, config=config), padded, steps, _PIECE, "filtering")
+    return info
 
 
 def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str, Any]:

@@ -61,8 +61,7 @@ def main(config: MapLogConfig) -> dict[str, Any]:
     """Make the map, write it, the picture and the report."""
     _check(config)
     out = output_folder(config.out)
-    fov = None if config.fov is None else math.radians(config.fov)
-    log = read(config.log, config.format, fov=fov, laser_offset=config.laser_offset)
+    log = read(config.log, config.format, fov=in_radians(config.fov), laser_offset=config.laser_offset)
     if config.quick:
         log = log.with_scans(slice(_PIECE))
     params = params_or(config.params, course_params())
@@ -124,10 +123,20 @@ def _check(config: MapLogConfig) -> None:
         raise ValueError(f"resolution: expected metres > 0, got {config.resolution}")
     if not (math.isfinite(config.max_range) and config.max_range > _MIN_RANGE):
         raise ValueError(f"max_range: expected metres > {_MIN_RANGE}, got {config.max_range}")
-    if config.fov is not None and not 0 < config.fov <= 360:
-        raise ValueError(f"fov: expected degrees in (0, 360], got {config.fov}")
+    in_radians(config.fov)
     if config.laser_offset is not None and not np.all(np.isfinite(config.laser_offset)):
         raise ValueError(f"laser_offset: expected finite DX DY DTHETA, got {config.laser_offset}")
+
+
+def in_radians(fov: float | None) -> float | None:
+    """The option of that name, degrees, as the readers take it.
+
+    Raises:
+        ValueError: out of its range.
+    """
+    if fov is not None and not 0 < fov <= 360:
+        raise ValueError(f"fov: expected degrees in (0, 360], got {fov}")
+    return None if fov is None else math.radians(fov)
 
 
 def say_doubts(log: Log, max_range: float) -> None:

@@ -19,13 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from common import CONSOLE, command_line, count_rows, output_folder, params_or, progress_bar, saved, show, write_report
-from map_log import make_map, ready
+from common import CONSOLE, command_line, count_rows, in_pieces, output_folder, params_or, saved, show, write_report
+from map_log import in_radians, make_map, ready
 
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, init, plotting, run
 from jaxlocmap.consistency import readable
 from jaxlocmap.logs import Log, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
-from jaxlocmap.logs.relations import Relations, moved
+from jaxlocmap.logs.poses import between, compose, wrapped
+from jaxlocmap.logs.relations import Relations, pairs
 from jaxlocmap.mapping import quality
 from jaxlocmap.mapping.ros import save_map
 from jaxlocmap.matching import submaps
@@ -92,8 +93,7 @@ def main(config: SlamConfig) -> dict[str, Any]:
     _check(config)
     out = output_folder(config.out)
     merge_kernels()
-    fov = None if config.fov is None else math.radians(config.fov)
-    log, repeated = in_order(read(config.log, config.format, fov=fov))
+    log, repeated = in_order(read(config.log, config.format, fov=in_radians(config.fov)))
     if len(log.scan_odometry) != len(log.scan) or not len(log.scan):
         raise ValueError(f"{config.log}: expected laser scans with odometry, got {len(log.scan)} without")
     if config.quick:
@@ -128,8 +128,7 @@ def _check(config: SlamConfig) -> None:
     for name in ("max_range", "resolution"):
         if not 0 < getattr(config, name) < math.inf:
             raise ValueError(f"{name}: expected metres > 0, got {getattr(config, name)}")
-    if config.fov is not None and not 0 < config.fov <= 360:
-        raise ValueError(f"fov: expected degrees in (0, 360], got {config.fov}")
+    in_radians(config.fov)
 
 
 def in_order(log: Log) -> tuple[Log, int]:
@@ -147,8 +146,8 @@ def _scored(config: SlamConfig, log: Log) -> dict[str, Relations]:
         reference = read_trajectory(config.reference)
         scored["revisits"] = revisits(reference.time, reference.pose)
     for name, relations in scored.items():
-        common = np.isin(np.round(relations.time, 3), np.round(log.scan_time, 3)).all(axis=1)
-        if not common.any():
+        _, _, there = pairs(log.scan_time, relations)
+        if not there.any():
             span = f"{log.scan_time[0]:.3f} to {log.scan_time[-1]:.3f} s"
             raise ValueError(f"{name}: expected pairs of stamps of the log, {span}, got none: do their clocks differ?")
     return scored
@@ -194,7 +193,7 @@ def match_log(
         What every scan reports, the last state, and seconds: of compiling, and of a scan.
     """
     scans, angles = len(log.scan), jnp.asarray(log.beam_angles, jnp.float32)
-    steps = np.concatenate([np.zeros((1, POSE)), moved(log.scan_odometry[:-1], log.scan_odometry[1:])])
+    steps = np.concatenate([np.zeros((1, POSE)), between(log.scan_odometry[:-1], log.scan_odometry[1:])])
     fill = -scans % _PIECE
     inputs = Inputs(
         dt=jnp.ones(scans + fill),
@@ -211,15 +210,13 @@ def match_log(
     began = time.perf_counter()
     first = jax.tree.map(lambda x: x[:_PIECE], inputs)
     program = _piece.lower(params, state, first, angles, config=config).compile()
-    compiled, reports = time.perf_counter(), []
-    with progress_bar("matching", scans) as progress:
-        for begin in range(0, scans, _PIECE):
-            piece = jax.tree.map(lambda x, begin=begin: x[begin : begin + _PIECE], inputs)
-            state, info = program(params, state, piece, angles)
-            reports.append(jax.tree.map(np.asarray, info))
-            progress(min(begin + _PIECE, scans))
+    compiled = time.perf_counter()
+
+    def turn(state: State, piece: Inputs) -> tuple[State, Info]:
+        return program(params, state, piece, angles)
+
+    state, info = in_pieces(turn, state, inputs, scans, _PIECE, "matching")
     each = 1e3 * (time.perf_counter() - compiled) / (scans + fill)
-    info = jax.tree.map(lambda *pieces: np.concatenate(pieces)[:scans], *reports)
     return info, state, {"compile_s": compiled - began, "ms_per_scan": each}
 
 
@@ -229,11 +226,8 @@ def on_the_map(info: Info) -> tuple[np.ndarray, np.ndarray]:
     """
     mean = np.asarray(info.belief.mean, np.float64)
     local = np.asarray(jax.vmap(lambda mean: submaps.relative_pose(mean, _OLDER)[0])(info.belief.mean), np.float64)
-    anchor = mean[:, _OLDER : _OLDER + POSE]
-    cos, sin = np.cos(anchor[:, 2]), np.sin(anchor[:, 2])
-    x, y = cos * local[:, 0] - sin * local[:, 1], sin * local[:, 0] + cos * local[:, 1]
-    turn = anchor[:, 2] + local[:, 2]
-    poses = np.stack([anchor[:, 0] + x, anchor[:, 1] + y, (turn + np.pi) % (2 * np.pi) - np.pi], axis=-1)
+    poses = compose(mean[:, _OLDER : _OLDER + POSE], local)
+    poses[:, 2] = wrapped(poses[:, 2])
     return poses, np.asarray(info.belief.cov, np.float64)[:, :POSE, :POSE]
 
 
@@ -313,10 +307,7 @@ def _write(
 ) -> dict[str, Any]:
     """The trajectory, the occupancy map made at its poses, the map of lines; what the report says of them."""
     write_tum(out / "estimate.tum", log.scan_time, poses)
-    dx, dy, turn = config.laser_offset
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    scanner = poses + np.stack([cos * dx - sin * dy, sin * dx + cos * dy, np.full(len(poses), turn)], axis=-1)
-    seen = dataclasses.replace(log, truth=scanner, truth_time=log.scan_time)
+    seen = dataclasses.replace(log, truth=compose(poses, config.laser_offset), truth_time=log.scan_time)
     local, spec, mapping = ready(seen, config.resolution, config.max_range)
     log_odds, _, _ = make_map(params, local, mapping)
     cells = save_map(out, log_odds, spec, name="map")

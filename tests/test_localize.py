@@ -19,6 +19,7 @@ from jaxlocmap.filters import ekf
 from jaxlocmap.logs import Log, Timeline
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
+import common
 import localize
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
@@ -154,7 +155,7 @@ def test_a_log_is_filtered_in_pieces_as_in_one(monkeypatch):
     """Of 20 steps in pieces of 8, each going on where the last one stopped, against NumPy."""
     monkeypatch.setattr(localize, "_PIECE", 8)
     moved = Recorder()
-    monkeypatch.setattr(localize, "progress_bar", lambda what, steps: _entered(moved, (what, steps)))
+    monkeypatch.setattr(common, "progress_bar", lambda what, steps: _entered(moved, (what, steps)))
     rng = np.random.default_rng(0)
     steps, landmarks = 20, np.array([[4.0, 1.0], [1.0, 5.0]])
     inputs = Inputs(

@@ -15,7 +15,7 @@ from test_logs import write
 
 from jaxlocmap import Params, simulation
 from jaxlocmap.logs import read_trajectory, write_tum
-from jaxlocmap.logs.relations import moved
+from jaxlocmap.logs.poses import between as moved
 from jaxlocmap.mapping.ros import load_map
 from jaxlocmap.matching.storage import load_lines
 

@@ -18,7 +18,7 @@ from jaxlocmap._internal.linalg import Matrix, inverse
 from jaxlocmap.filters import information
 from jaxlocmap.mapping import grid
 from jaxlocmap.matching import lines as line_grid
-from jaxlocmap.matching.normals import Points, surface_points
+from jaxlocmap.matching.normals import NO_RETURN, Points, surface_points
 from jaxlocmap.matching.submaps import MATCH_SCALE, MATCH_STD
 from jaxlocmap.se2 import POSE, between
 from jaxlocmap.step import predict
@@ -26,7 +26,6 @@ from jaxlocmap.types import Gaussian, Matcher, Scanner
 
 SPEC = GridSpec(origin=(-3.0, -3.0), resolution=0.1, shape=(260, 400))  # holds either world and some error
 _LEAST_POINTS = 10  # that say anything of the pose, or the match does not count
-_NO_RETURN = 0.15  # m below `max_range`, as in `matching.normals`
 _HIT, _MISS = 2.2, -0.4  # nats: log-odds of 0.9 and 0.4, as Hector SLAM adds them
 _PROBABILITY_STD = 0.3  # of a residual on the occupancy grid, for the solver alone
 _CERES = (20.0, 1.0, 100.0, 2.34e-4)  # weights of scan, translation and rotation, and the scale of the covariance
@@ -305,7 +304,7 @@ def _filtered(
     def block(carry: tuple[Gaussian, Any], now: tuple[jax.Array, jax.Array]) -> tuple[tuple[Gaussian, Any], Gaussian]:
         (belief, memory), (controls, ranges) = carry, now
         belief, _ = move(belief, controls[0])
-        hit = ranges < scanner.max_range - _NO_RETURN
+        hit = ranges < scanner.max_range - NO_RETURN
         points = surface_points(ranges, std, scanner=scanner, gap=matcher.gap)
         belief, memory = correct(belief, memory, Scan(jnp.where(hit, ranges, scanner.max_range), hit, points))
         corrected = belief.pose

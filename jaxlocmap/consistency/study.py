@@ -89,6 +89,7 @@ class Study:
         params.check()
         self.scenario.check(self.config)
         dtype = prior.mean.dtype
+        key, world = self._surroundings(key, world)
         params, world, noise = jax.tree.map(lambda x: jnp.asarray(x, dtype), (params, world, noise))
         config, scenario = self.config, self.scenario
         model, sensor = motion.resolve(config.motion), sensors.resolve(config.sensor)
@@ -203,29 +204,19 @@ class Study:
         del key, params, world, noise
         return init(prior.first(motion.resolve(self.config.motion).dim), config=self.config)
 
+    def _surroundings(self, key: jax.Array, world: World) -> tuple[jax.Array, World]:
+        """What stands around a run, and the key of the rest of it."""
+        return key, world
+
 
 class RandomBuildings(Study):
-    """The same with a building of its own for every run, drawn by `simulation.random_building`."""
+    """The same with a building of its own for every run, drawn by `simulation.random_building`: of the world that it is
+    called with, the landmarks alone count.
+    """
 
-    def __call__(
-        self,
-        key: jax.Array,
-        params: Params,
-        world: World,
-        noise: simulation.Noise,
-        prior: Gaussian,
-        *,
-        add_up: Callable[[Any], Any] = lambda own: own,
-    ) -> Totals:
-        """Totals of the run that `key` stands for.
-
-        Args:
-            key, params, noise, prior, add_up: as of `Study`.
-            world: of which the landmarks are observed; the walls are drawn.
-        """
+    def _surroundings(self, key: jax.Array, world: World) -> tuple[jax.Array, World]:
         world_key, key = jax.random.split(key)
-        drawn = simulation.random_building(world_key)._replace(landmarks=world.landmarks)
-        return super().__call__(key, params, drawn, noise, prior, add_up=add_up)
+        return key, simulation.random_building(world_key)._replace(landmarks=world.landmarks)
 
 
 def reference_study(scenario: simulation.Scenario, config: Config, noise: simulation.Noise) -> tuple[Study, Params]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxlocmap import files
 from jaxlocmap.logs.fan import Fan, check_fov, directions, fits
+from jaxlocmap.logs.poses import compose
 from jaxlocmap.logs.record import Log
 from jaxlocmap.logs.text import lines, numbers, whole
 
@@ -161,7 +162,7 @@ def _read(path: str | Path, fov: float | None, max_range: float | None, laser_of
         beam_angles_from=said_by,
         scan_max_range=fan.max_range,
         truth_time=time[: len(poses)],
-        truth=poses if mounted is None else _seen_from(poses, mounted),
+        truth=poses if mounted is None else compose(poses, mounted),
         counts=counts,
     )
 
@@ -264,11 +265,3 @@ def _driven(scans: list[_Scan], odometry: list[tuple[str, list[str]]]) -> tuple[
     kept = [scan for scan in scans if time[0] <= scan.stamp <= time[-1]]
     stamps = [scan.stamp for scan in kept]
     return kept, np.stack([np.interp(stamps, time, p) for p in (x, y, np.unwrap(theta))], axis=-1)
-
-
-def _seen_from(poses: np.ndarray, offset: Sequence[float]) -> np.ndarray:
-    """Pose of what sits at an offset in the frame of each pose: p + R(theta) d, theta + dtheta."""
-    x, y, theta = poses.T
-    dx, dy, dtheta = offset
-    sin, cos = np.sin(theta), np.cos(theta)
-    return np.stack([x + cos * dx - sin * dy, y + sin * dx + cos * dy, theta + dtheta], axis=-1)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlocmap import checks, files
+from jaxlocmap.logs.poses import between, wrapped
 from jaxlocmap.logs.text import lines, numbers
 
 _FIELDS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
@@ -71,7 +72,23 @@ def revisits(time: np.ndarray, poses: np.ndarray) -> Relations:
         again = np.flatnonzero((time - time[i] > _APART) & (np.hypot(*(poses[:, :2] - poses[i, :2]).T) < _NEAR))
         first += [i] * len(again)
         second += again.tolist()
-    return Relations(np.stack([time[first], time[second]], axis=-1), moved(poses[first], poses[second]))
+    return Relations(np.stack([time[first], time[second]], axis=-1), between(poses[first], poses[second]))
+
+
+def pairs(time: np.ndarray, relations: Relations) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The relations whose two moments are both stamps of a trajectory.
+
+    Args:
+        time: (T,) s, increasing.
+        relations: K of them.
+
+    Returns:
+        (M,) each: places of the two stamps in `time`; and (K,) bool: which relations they are of.
+    """
+    beyond = np.clip(np.searchsorted(time, relations.time), 1, len(time) - 1)
+    nearest = beyond - (relations.time - time[beyond - 1] < time[beyond] - relations.time)
+    there = np.all(np.abs(time[nearest] - relations.time) < _SAME_TIME, axis=1)
+    return *nearest[there].T, there
 
 
 def relation_errors(time: np.ndarray, poses: np.ndarray, relations: Relations) -> RelationErrors:
@@ -93,22 +110,8 @@ def relation_errors(time: np.ndarray, poses: np.ndarray, relations: Relations) -
     """
     checks.shape("time", time, (None,))
     checks.shape("poses", poses, (len(time), 3))
-    beyond = np.clip(np.searchsorted(time, relations.time), 1, len(time) - 1)
-    nearest = beyond - (relations.time - time[beyond - 1] < time[beyond] - relations.time)
-    there = np.all(np.abs(time[nearest] - relations.time) < _SAME_TIME, axis=1)
-    first, second = nearest[there].T
-    error = moved(poses[first], poses[second]) - relations.moved[there]
+    first, second, there = pairs(time, relations)
+    error = between(poses[first], poses[second]) - relations.moved[there]
     return RelationErrors(
-        np.hypot(error[:, 0], error[:, 1]), np.abs(_wrapped(error[:, 2])), np.diff(relations.time[there])[:, 0]
+        np.hypot(error[:, 0], error[:, 1]), np.abs(wrapped(error[:, 2])), np.diff(relations.time[there])[:, 0]
     )
-
-
-def moved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Poses b in the frames of poses a, (..., 3) each: m, m, rad."""
-    x, y, turn = np.moveaxis(b - a, -1, 0)
-    cos, sin = np.cos(a[..., 2]), np.sin(a[..., 2])
-    return np.stack([cos * x + sin * y, cos * y - sin * x, _wrapped(turn)], axis=-1)
-
-
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    return (angle + np.pi) % (2 * np.pi) - np.pi

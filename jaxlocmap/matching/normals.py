@@ -12,7 +12,9 @@ from jaxlocmap.types import Scanner
 
 _RADIUS = 0.3  # m: beams that end within it are fitted by one line, and the next on each side if it is not farther
 _NEIGHBOURS = 8  # beams on each side at most: a normal needs no more
-_FAR = 0.15  # m below `max_range`: there a beam without a return, which reads max_range and noise, looks like a hit
+NO_RETURN = (
+    0.15  # m below `max_range`: there a beam without a return, which reads max_range and noise, looks like a hit
+)
 
 
 class Points(NamedTuple):
@@ -45,7 +47,7 @@ def surface_points(ranges: jax.Array, std: jax.Array | float, *, scanner: Scanne
     beams = len(scanner.beam_angles)
     checks.shapes(ranges=(ranges, (beams,)), std=(std, ()))
     dx, dy, turn = scanner.offset
-    hit = jnp.isfinite(ranges) & (ranges > scanner.min_range) & (ranges < scanner.max_range - _FAR)
+    hit = jnp.isfinite(ranges) & (ranges > scanner.min_range) & (ranges < scanner.max_range - NO_RETURN)
     reach, angles = jnp.where(hit, ranges, 1), scanner.beam_angles + turn
     x, y = dx + reach * jnp.cos(angles), dy + reach * jnp.sin(angles)
 
