@@ -147,6 +147,22 @@ def test_one_of_several_maps_in_an_array_is_like_one_alone():
         jax.tree.map(np.testing.assert_array_equal, there, fit(alone, pose, points, jnp.asarray(SCALE)))
 
 
+def test_maps_are_cleared_where_a_run_says_so_and_derivatives_go_with_them():
+    maps = jnp.asarray(np.random.default_rng(3).normal(size=(3, 8, 4, 6)))  # of three runs, two of 4 x 4 cells each
+    clear = np.array([[False, True], [False, False], [True, True]])
+    kept = np.repeat(~clear, 4, axis=1)[..., None, None].astype(maps.dtype)
+    nis = jnp.array([1.0, jnp.nan, 2.0])
+    np.testing.assert_array_equal(jax.vmap(lines.cleared)(maps, clear, nis), maps * kept)
+
+    def loss(maps):
+        return jnp.sum(jax.vmap(lines.cleared)(maps, clear, jnp.sum(maps, axis=(1, 2, 3))) ** 2)
+
+    for slope in (jax.grad(loss)(maps), jax.jacfwd(loss)(maps)):
+        np.testing.assert_allclose(slope, 2 * maps * kept, rtol=1e-6)
+    alone = jax.jit(lines.cleared)(maps[0], clear[0], nis[0])
+    np.testing.assert_array_equal(alone, (maps * kept)[0])
+
+
 def test_the_sign_of_a_normal_does_not_matter(tolerance):
     points, pose = seen(ranges_in_room((6.0, 2.0, 0.3), noise=STD)), jnp.array([0.02, 0.01, 0.01])
     turned = points._replace(normal=points.normal * jnp.where(jnp.arange(61) % 2 == 0, 1.0, -1.0)[:, None])

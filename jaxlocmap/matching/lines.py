@@ -10,13 +10,14 @@ normal does not matter, and a thin wall may be seen from both sides.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import checks
+from jaxlocmap._internal.batching import any_in_batch
 from jaxlocmap._internal.linalg import stack_scalars
 from jaxlocmap._internal.trig import sin_cos
 from jaxlocmap.matching.normals import Points
@@ -136,6 +137,40 @@ def fit(
     hessian = [[jnp.sum(share * J[min(i, j)] * J[max(i, j)]) for j in range(POSE)] for i in range(POSE)]
     slope = jnp.stack([jnp.sum(share * Ji * residual) for Ji in J])
     return Fit(stack_scalars(hessian), slope, residual, jnp.stack([J_x, J_y], axis=-1), used, share)
+
+
+@jax.custom_jvp
+def cleared(lines: jax.Array, clear: jax.Array, after: jax.Array) -> jax.Array:
+    """Maps in one array, some of them cleared. Under `vmap` that takes time only where a run of the batch clears one.
+
+    Args:
+        lines: (maps * rows, columns, 6).
+        clear: (maps,) bool, which to clear.
+        after: () something computed from the maps before, of any value. By its derivative the compiler knows that
+            derivatives of the maps are read before they are cleared, and need not be copied.
+    """
+    some = any_in_batch(jnp.any(clear)).astype(int)
+    # Not a branch: one inside a loop makes the compiler copy the maps (jaxlib 0.10 on CPUs, under `shard_map`).
+    return jax.lax.fori_loop(0, some, lambda _, lines: _set(lines, clear, jnp.zeros_like(after)), lines)
+
+
+@cleared.defjvp
+def _cleared_jvp(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+    """Along the maps, with a branch after all: a loop of unknown length has no derivative backwards."""
+    (_, clear, after), (lines_dot, _, after_dot) = primals, tangents
+    zero = 0 * jnp.where(jnp.isfinite(after), after_dot, 0)
+    some = any_in_batch(jnp.any(clear))
+    return cleared(*primals), jax.lax.cond(some, lambda x: _set(x, clear, zero), lambda x: x, lines_dot)
+
+
+def _set(lines: jax.Array, which: jax.Array, value: jax.Array) -> jax.Array:
+    """Maps in one array, everything in some of them set to a value."""
+    maps = len(which)
+    flat = lines.reshape(maps, -1)
+    for i in range(maps):
+        # That the index is unique, as one alone is, makes the derivative a plain copy.
+        flat = flat.at[jnp.where(which[i], i, maps)].set(value, mode="drop", unique_indices=True)
+    return flat.reshape(lines.shape)
 
 
 def overlap(

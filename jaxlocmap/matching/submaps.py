@@ -273,11 +273,9 @@ def match_scan(
     which = jnp.where(finished, 1 - submaps.older, submaps.older)
     scans = jnp.where(finished, jnp.stack([submaps.scans[1], jnp.zeros((), jnp.int32)]), submaps.scans)
     scans = jnp.where(anew, 0, scans)
-    lines = submaps.lines.reshape(matcher.maps, -1)
-    for cleared, slot in ((due, 1 - which), (anew, which)) if matcher.maps == 2 else ():
-        # That the index is unique, as one alone is, makes the derivative a plain copy.
-        lines = lines.at[jnp.where(cleared, slot, 2)].set(0, mode="drop", unique_indices=True)
-    lines = lines.reshape(submaps.lines.shape)
+    lines = submaps.lines
+    if matcher.maps == 2:
+        lines = line_grid.cleared(lines, jnp.where(jnp.arange(2, dtype=jnp.int32) == which, anew, due), nis)
 
     # Add the scan to both, and read the map after that: a read in between would cost a copy of it.
     added = jnp.stack([accepted | anew, (accepted & active) | due])
