@@ -15,6 +15,7 @@ import optax
 from common import CONSOLE, command_line, output_folder, saved, write_report
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from tune_matching import from_drawn_worlds
 from tune_options import TuneConfig, checked, loss_weights, tuned_parameters
 from tune_sources import Source, Wanted, from_robots, from_scans, from_scenario
 
@@ -68,7 +69,7 @@ def _tune(config: TuneConfig, out: Path, kept: list[str]) -> dict[str, Any]:
         sure = tuning.standard_errors(objective, found.params, source.compared, tuned)
         report = {
             **descent,
-            "parameters": _parameters(source.start, found.params, sure),
+            "parameters": _parameters(objective, source.start, found.params, sure),
             "correlation": dict(names=list(sure.names), matrix=sure.correlation.tolist()),
             "not_identified": list(sure.words),
             "loss": _losses(objective, source, found.params),
@@ -88,6 +89,8 @@ def _source(config: Any, losses: tuple[str, ...]) -> Source:
     """Of a config with its defaults filled in, whose fields the type checker takes for None."""
     start = None if config.params is None else Params.load(config.params)
     wanted = Wanted(losses, start, config.gate, config.judge_gate, config.seed, config.quick, config.max_gap)
+    if config.match:
+        return from_drawn_worlds(config.motion, config.runs, config.judge_runs, wanted)
     if config.log is None:
         return from_scenario(config.scenario, config.motion, config.runs, config.judge_runs, wanted)
     if config.format == "carmen":
@@ -99,7 +102,7 @@ def _source(config: Any, losses: tuple[str, ...]) -> Source:
 def _fit(
     config: Any, objective: tuning.Objective, source: Source, tuned: tuple[str, ...], out: Path, kept: list[str]
 ) -> tuning.Fit:
-    with _bar(config.epochs, tuned, out, kept) as progress:
+    with _bar(config.epochs, objective, tuned, out, kept) as progress:
         return tuning.fit(
             objective,
             source.start,
@@ -116,7 +119,9 @@ def _fit(
 
 
 @contextmanager
-def _bar(epochs: int, tuned: tuple[str, ...], out: Path, kept: list[str]) -> Iterator[Callable[[tuning.Fit], None]]:
+def _bar(
+    epochs: int, objective: tuning.Objective, tuned: tuple[str, ...], out: Path, kept: list[str]
+) -> Iterator[Callable[[tuning.Fit], None]]:
     """A bar with the loss and the parameters; the best so far is on disk after every epoch."""
     columns = (TextColumn("{task.description}", markup=False), BarColumn(20), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=CONSOLE, transient=True) as bar:
@@ -126,22 +131,25 @@ def _bar(epochs: int, tuned: tuple[str, ...], out: Path, kept: list[str]) -> Ite
             fit.params.save(out / "params.json")
             done = len(fit.losses) - 1
             kept.append(f"the best of {done} epochs is kept in {out / 'params.json'}, from which --params goes on")
-            best = tuning.natural(fit.params)
+            best = tuning.natural(fit.params, objective.blocks)
             values = ", ".join(f"{name} {float(best[name]):.4g}" for name in tuned)
             bar.update(task, completed=done, description=f"loss {fit.loss:.5g}: {values}")
 
         yield move
 
 
-def _parameters(start: Params, end: Params, sure: tuning.StandardErrors) -> dict[str, dict[str, Any]]:
-    before, after = tuning.natural(start), tuning.natural(end)
+def _parameters(
+    objective: tuning.Objective, start: Params, end: Params, sure: tuning.StandardErrors
+) -> dict[str, dict[str, Any]]:
+    before, after = (tuning.natural(params, objective.blocks) for params in (start, end))
+    units = tuning.units_of(objective.blocks)
     return {
         name: {
             "start": float(before[name]),
             "end": float(after[name]),
             "standard_error": float(error),
             "interval_95": interval.tolist(),
-            "unit": tuning.UNITS[name],
+            "unit": units[name],
         }
         for name, error, interval in zip(sure.names, sure.standard_error, sure.interval_95, strict=True)
     }
@@ -185,9 +193,12 @@ def _figures(out: Path, source: Source, report: dict[str, Any], before: Any, aft
             out / "calibration.png", before["one_scan_ahead"], after["one_scan_ahead"], source.name
         )
         files.append("calibration.png")
-    if "nees_per_step" in after:
-        plotting.study_before_after_figure(out / "nees.png", before, after, source.dt)
-        files.append("nees.png")
+    studies = {"nees.png": (before, after)} if "nees_per_step" in after else {}
+    worlds = [name for name, x in after.items() if isinstance(x, dict) and "nees_band_95" in x]
+    studies |= {f"nees_{name}.png": (before[name], after[name]) for name in worlds}
+    for file, pair in studies.items():
+        plotting.study_before_after_figure(out / file, *pair, source.dt)
+        files.append(file)
     drives = {
         name: {
             "time": after[name]["time"],
@@ -197,7 +208,7 @@ def _figures(out: Path, source: Source, report: dict[str, Any], before: Any, aft
             "nees_after": after[name]["nees_per_step"],
         }
         for name in after
-        if isinstance(after[name], dict) and after[name].get("anees") is not None
+        if isinstance(after[name], dict) and after[name].get("anees") is not None and name not in worlds
     }
     if drives:
         plotting.log_before_after_figure(out / "nees.png", drives)

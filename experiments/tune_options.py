@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from common import check_gate
+from tune_matching import MATCHING_NOISE
 from tune_sources import JUDGE_GATE, TUNING_GATE
 
 from jaxlocmap import tuning
@@ -20,6 +21,8 @@ class TuneConfig:
 
     scenario: Literal["capstone", "loop"] | None = None
     """Simulated drives to tune on where there is no log, capstone by default."""
+    match: bool = False
+    """A filter that matches scans and observes no landmarks, on drives through rooms and buildings drawn anew."""
     log: Path | None = None
     """A log to tune on: a file for woods and carmen, a folder for mrclam."""
     format: Literal["woods", "mrclam", "carmen"] | None = None
@@ -31,8 +34,8 @@ class TuneConfig:
     loss: tuple[str, ...] = ("innovation_nll",)
     """innovation_nll, pose_nll, mse, nees, nis, map; several with weights: pose_nll=1 nees=0.5."""
     tune: tuple[str, ...] | None = None
-    """Which of v, w, v_w, range, bearing, range_bearing, l_occ, l_free; by default what the losses depend on, with Q
-    and R diagonal."""
+    """Which of v, w, v_w, range, bearing, range_bearing, l_occ, l_free, with --match also match_std, match_scale,
+    map_length; by default what the losses depend on, with Q and R diagonal."""
     full: bool = False
     """Q and R with their correlations, where --tune does not say."""
     params: Path | None = None
@@ -40,9 +43,9 @@ class TuneConfig:
     motion: Literal["arc", "euler", "capstone"] | None = None
     """The filter's motion model, arc by default; a carmen log states the poses."""
     runs: int | None = None
-    """Simulated runs to tune on, by default 512, with --quick 32."""
+    """Simulated runs to tune on, by default 512, with --quick 32; with --match 24 and 4."""
     judge_runs: int | None = None
-    """Fresh simulated runs to judge by, by default 2,000, with --quick 100."""
+    """Fresh simulated runs to judge by, by default 2,000, with --quick 100; with --match 100 and 4."""
     gate: float | None = TUNING_GATE
     """The gate while tuning, which weighs readings instead of deciding. It is for what is surely false: one that also
     refuses a good reading in a hundred pulls the result by some per cent."""
@@ -72,8 +75,9 @@ class TuneConfig:
 _LOGS_OF_ROBOTS = ("woods", "mrclam")
 _APPLIES = {  # to what is tuned on; options not named here apply to all
     "scenario": ("scenario",),
-    "runs": ("scenario",),
-    "judge_runs": ("scenario",),
+    "match": ("scenario",),
+    "runs": ("scenario"),
+    "judge_runs": ("scenario"),
     "robots": ("mrclam",),
     "judged": ("mrclam",),
     "motion": ("scenario", *_LOGS_OF_ROBOTS),
@@ -95,6 +99,7 @@ _DEFAULTS = {
     "judge_runs": 2000,
 }
 _QUICK = {"epochs": 2, "runs": 32, "judge_runs": 100}
+_MATCHING, _QUICK_MATCHING = {"runs": 24, "judge_runs": 100}, {"runs": 4, "judge_runs": 4}
 _LASER_RANGE = 20.0  # m
 _RENAMED = {"innovation": "innovation_nll", "pose": "pose_nll", "state": "mse"}  # the losses' former names
 _DEPENDS = {"map": tuning.SENSOR_MODEL}
@@ -119,6 +124,8 @@ def checked(config: TuneConfig) -> TuneConfig:
     _check_values(config)
     _check_combinations(config)
     defaults = _DEFAULTS | (_QUICK if config.quick else {})
+    if config.match:
+        defaults |= _QUICK_MATCHING if config.quick else _MATCHING
     if kind == "carmen":
         defaults["max_range"] = _LASER_RANGE
     absent = {name: value for name, value in defaults.items() if getattr(config, name) is None}
@@ -154,6 +161,11 @@ def _check_combinations(config: TuneConfig) -> None:
         raise ValueError("full: applies where Q and R are tuned and --tune is not given: expected it not to be given")
     if config.format == "carmen" and losses != ["map"]:
         raise ValueError(f"loss: a carmen log has no landmarks: expected `map` alone, got {', '.join(losses)}")
+    if config.match and config.scenario is not None:
+        raise ValueError(f"scenario: with match every drive has a world of its own: expected none, got {config.scenario}")
+    if config.match and (config.full or any(name in ("innovation_nll", "nis", "map") for name in losses)):
+        got = ", ".join(losses) + (" and full" if config.full else "")
+        raise ValueError(f"loss, full: with match nothing is observed: expected pose_nll, mse or nees alone, got {got}")
     noise = [name for name in config.tune or () if name not in tuning.SENSOR_MODEL]
     if config.format == "carmen" and noise:
         raise ValueError(
@@ -191,6 +203,8 @@ def tuned_parameters(config: TuneConfig) -> tuple[str, ...]:
     """What `tune` names, or else what the losses depend on."""
     if config.tune is not None:
         return config.tune
+    if config.match:
+        return MATCHING_NOISE
     noise = tuning.FULL_NOISE if config.full else tuning.NOISE
     names = [name for loss, _ in loss_weights(config) for name in _DEPENDS.get(loss, noise)]
     return tuple(name for name in tuning.NAMES if name in names)
