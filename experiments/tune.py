@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import optax
 from common import CONSOLE, command_line, output_folder, saved, write_report
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -257,8 +258,9 @@ def _print(report: dict[str, Any]) -> None:
     groups |= {name: (before[name], after[name]) for name, x in after.items() if isinstance(x, dict)}
     for group, (old, new) in groups.items():
         for key, words in _SHOWN:
-            if new.get(key) is not None and old.get(key) is not None:
-                table.add_row(_GROUPS.get(group, group), words, readable(old[key], 4), readable(new[key], 4))
+            values = old.get(key), new.get(key)
+            if None not in values and not np.isnan(values).all():  # of what was not observed there is none
+                table.add_row(_GROUPS.get(group, group), words, *(readable(value, 4) for value in values))
     CONSOLE.print(table)
     for name, rows in report["loss"].items():
         pairs = [

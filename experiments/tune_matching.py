@@ -82,7 +82,7 @@ def in_buildings(key: jax.Array, count: int, steps: int) -> tuning.Batch:
     whole = tuning.simulated(of_drives, count, worlds, noise, scenario=scenario, scans=True, worlds=True)
     truth = np.asarray(whole.truth)
     known = np.broadcast_to(np.diag(np.square(_EXACT)), (*truth.shape, truth.shape[-1]))
-    pieces = tuning.windows(whole, steps, run_in=0, beliefs=Gaussian(whole.truth, jnp.asarray(known)))
+    pieces = tuning.windows(whole, steps, run_in=0, beliefs=Gaussian(jnp.asarray(truth), jnp.asarray(known)))
     per_round = -(-a_round // steps)
     return tuning.pick(pieces, np.arange(count) * per_round + np.arange(count) % per_round)
 

@@ -76,8 +76,8 @@ _LOGS_OF_ROBOTS = ("woods", "mrclam")
 _APPLIES = {  # to what is tuned on; options not named here apply to all
     "scenario": ("scenario",),
     "match": ("scenario",),
-    "runs": ("scenario"),
-    "judge_runs": ("scenario"),
+    "runs": ("scenario",),
+    "judge_runs": ("scenario",),
     "robots": ("mrclam",),
     "judged": ("mrclam",),
     "motion": ("scenario", *_LOGS_OF_ROBOTS),
@@ -162,7 +162,7 @@ def _check_combinations(config: TuneConfig) -> None:
     if config.format == "carmen" and losses != ["map"]:
         raise ValueError(f"loss: a carmen log has no landmarks: expected `map` alone, got {', '.join(losses)}")
     if config.match and config.scenario is not None:
-        raise ValueError(f"scenario: with match every drive has a world of its own: expected none, got {config.scenario}")
+        raise ValueError(f"scenario: with match each drive has its own world: expected none, got {config.scenario}")
     if config.match and (config.full or any(name in ("innovation_nll", "nis", "map") for name in losses)):
         got = ", ".join(losses) + (" and full" if config.full else "")
         raise ValueError(f"loss, full: with match nothing is observed: expected pose_nll, mse or nees alone, got {got}")

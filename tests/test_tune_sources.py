@@ -426,7 +426,7 @@ def made_fit():
 
 def test_the_best_so_far_is_on_disk_after_every_epoch(tmp_path):
     kept = []
-    with tune._bar(5, ("v",), tmp_path, kept) as move:
+    with tune._bar(5, tuning.Objective(Config(), (("mse", 1.0),)), ("v",), tmp_path, kept) as move:
         move(made_fit())
     np.testing.assert_allclose(Params.load(tmp_path / "params.json").R, START.R, rtol=1e-6)
     assert kept == [f"the best of 1 epochs is kept in {tmp_path}/params.json, from which --params goes on"]
@@ -460,7 +460,7 @@ def test_the_whole_program(monkeypatch, tmp_path):
     losses = {("own", "train"): 8.0, ("own", "validation"): 7.0, ("found", "train"): 6.0, ("found", "validation"): 5.0}
 
     class Objective:
-        names = ("pose_nll",)
+        names, blocks = ("pose_nll",), tuning.blocks_of(source.config)
 
         def __init__(self, config, weights):
             assert (config, weights) == (source.config, (("pose_nll", 2.0),))
