@@ -5,6 +5,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import pytest
 from test_experiments import is_png
 from test_logs import write
 
-from jaxlocmap import Params, simulation
+from jaxlocmap import Gaussian, Params, simulation
 from jaxlocmap.logs import read_trajectory, write_tum
 from jaxlocmap.logs.poses import between as moved
 from jaxlocmap.mapping.ros import load_map
@@ -88,7 +89,17 @@ def test_the_trajectory_is_better_than_the_wheels_and_within_its_sigma(made):
     assert (report["matched"], report["tried"], report["scans"]) == (SCANS - 1, SCANS - 1, SCANS)
     assert report["refused"] == {"points": 0, "share": 0, "nis": 0, "convergence": 0}
     assert report["path_m"] == pytest.approx(3.2 * 2 * math.pi * 1.15, rel=0.02)
+    assert (report["refused_most_in_a_row"], report["refused_most_from_s"]) == (0, None)
     assert not report["careful"]
+
+
+def test_the_pose_on_the_map_is_where_the_scan_was_drawn():
+    """Of a robot at (2, 1), on a map whose anchor is at (1, 1), turned left, and which errs by (0.1, 0.2, 0.05)."""
+    mean = jnp.array([[2, 1, math.pi, 1, 1, math.pi / 2, 0.1, 0.2, 0.05, *np.zeros(6)]])
+    info = SimpleNamespace(belief=Gaussian(mean, jnp.diag(jnp.arange(15.0))[None]))
+    poses, cov = slam.on_the_map(info)
+    np.testing.assert_allclose(poses, [[1.8, 1.1, 0.05 - math.pi]], atol=1e-6)  # (0, -1) there is (1, 0) here
+    np.testing.assert_array_equal(cov, [np.diag([0, 1, 2])])
 
 
 def test_it_is_scored_by_what_is_known_from_elsewhere(made):

@@ -250,6 +250,19 @@ def test_a_finished_submap_reports_where_the_next_anchor_is(matched):
     assert not info.match.edge.mean[~info.match.finished].any()
 
 
+def test_a_submap_holds_the_scans_since_it_began_and_no_others(matched, tolerance):
+    """Of each cell W is a sum over points, and that of one point's 16 cells is 4."""
+    _, state, info = matched
+    maps = state.submaps.lines.reshape(RUNS, 2, -1, 6)[..., 5].sum(axis=-1, dtype=float)
+    for run_of in range(RUNS):
+        older = state.submaps.older[run_of]
+        added = (info.match.accepted | info.match.anew)[run_of]
+        points = info.match.points[run_of, added]
+        for slot, scans in zip((older, 1 - older), state.submaps.scans[run_of], strict=True):
+            assert scans > 0
+            assert maps[run_of, slot] == pytest.approx(4 * points[-scans:].sum(), rel=tolerance(1e-9, 1e-4))
+
+
 def test_a_kidnapped_robot_is_refused_and_its_map_stays(matched):
     """Carried to the other side of the room at step 200, without a word from the odometry."""
     _, inputs = drives(RUNS)
@@ -360,6 +373,9 @@ def test_a_known_map_is_matched_on_and_not_changed(matched):
     statistic, error = nees(info, np.asarray(truth)[:8] - np.array([6.0, 6.0, 0.0]))
     assert np.abs(error[:, 5:, :2]).max() < 0.08
     assert 0.8 < statistic[:, 5:].mean() < 4.5
+    # The map errs by as much here as elsewhere: what a match tells of its error is forgotten along the way.
+    of_map = np.sqrt(np.diagonal(state.belief.cov, axis1=1, axis2=2)[:, 6:9])
+    assert np.all(of_map > 0.5 * np.array([0.01, 0.01, 0.002]))
 
 
 def test_a_map_is_known_for_a_matcher_that_leaves_it():
