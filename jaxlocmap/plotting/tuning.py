@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,8 @@ def study_before_after_figure(path: Path, before: dict[str, Any], after: dict[st
     left.set(title="NEES of the pose on fresh runs: 3 if honest", xlabel="time [s]", ylabel="NEES [–]")
     from_zero(left)
     _coverage(right, before, after)
-    figure.suptitle(f"before: {before['verdict']}\nafter: {after['verdict']}", fontsize=10)
+    verdicts = (f"{when}: {study['verdict']}" for when, study in (("before", before), ("after", after)))
+    figure.suptitle("\n".join(textwrap.fill(verdict, 150) for verdict in verdicts), fontsize=10)
     save(figure, path, dpi=120)
 
 
