@@ -15,6 +15,7 @@ from common import CONSOLE, command_line, output_folder, replace_table
 from jaxlocmap import files, simulation
 from jaxlocmap.consistency import readable
 from jaxlocmap.logs import write_tum
+from jaxlocmap.monte_carlo import hosts
 
 _STUDIES: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("the course's noise, exact arc (the default)", "", {}),
@@ -76,6 +77,7 @@ class TablesConfig:
 def main(config: TablesConfig) -> dict[str, str]:
     """Run, and return the tables by name."""
     out = output_folder(config.out)
+    hosts.use_all_cores()
     tables = {"studies": _studies(config, out), "matches": _matches(config, out)}
     if config.data is not None:
         tables["logs"] = _logs(config, config.data, out)
