@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 from common import (
     CONSOLE,
+    GAP,
     ComputeConfig,
     check_gate,
     command_line,
@@ -28,6 +29,7 @@ from common import (
     start,
     study,
     study_checkpoint,
+    with_known_start,
     write_report,
 )
 from report_table import band, innovation_rows, match_rows, pose_rows, print_verdicts
@@ -41,8 +43,6 @@ from jaxlocmap.simulation import World
 from jaxlocmap.types import Matcher
 
 _REFERENCE_RUNS = 2000, 20_000  # at least and at most
-_EXACT = (1e-3, 1e-3, 1e-3)  # m, m, rad
-_GAP = 0.8  # m: the ends of the course's 61 beams lie far apart
 # What a study can be resumed by.
 _SETTINGS = (
     *("scenario", "motion", "gate", "start", "map", "seed"),
@@ -117,7 +117,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
         scenario = dataclasses.replace(scenario, steps=config.steps)
     scenario = dataclasses.replace(scenario, beams=config.beams)
     if config.exact_prior:
-        scenario = dataclasses.replace(scenario, exact_prior=False, prior_std=_EXACT)
+        scenario = with_known_start(scenario)
     noise = robot_noise(config)
     if config.runs < 1:
         raise ValueError(f"runs: expected at least 1, got {config.runs}")
@@ -130,7 +130,7 @@ def main(config: ConsistencyConfig) -> dict[str, Any]:
     own = simulation.own_params(noise, scenario)
     params = params_or(config.params, own if config.own_noise else simulation.course_params())
     if config.match:
-        settings = dataclasses.replace(settings, matcher=Matcher(period=config.match_every, gap=_GAP))
+        settings = dataclasses.replace(settings, matcher=Matcher(period=config.match_every, gap=GAP))
         params = with_defaults(params, std=config.scan_noise)
     key = jax.random.key(config.seed)
     named = {name: getattr(config, name) for name in _SETTINGS}

@@ -13,12 +13,14 @@ from baselines import scan_filters
 from baselines.scan_filters import ON_LINES, ON_OCCUPANCY
 from common import (
     CONSOLE,
+    GAP,
     command_line,
     output_folder,
     progress_bar,
     replace_table,
     saved,
     scenario_world,
+    with_known_start,
     write_report,
 )
 
@@ -30,8 +32,7 @@ from jaxlocmap.monte_carlo import hosts, monte_carlo
 from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Config, Matcher
 
-_EXACT = (1e-3, 1e-3, 1e-3)  # m, m, rad: how well the start is known
-_MATCHER = Matcher(period=5, gap=0.8)  # the ends of 61 beams lie far apart
+_MATCHER = Matcher(period=5, gap=GAP)
 _CHUNK = 5  # runs at once: their maps are large
 
 
@@ -120,7 +121,7 @@ def main(config: MatchingConfig) -> dict[str, Any]:
     done = 0
     with progress_bar("simulating", runs * len(_WAYS) * len(worlds)) as progress:
         for name, steps in worlds.items():
-            scenario = dataclasses.replace(simulation.SCENARIOS[name], steps=steps, exact_prior=False, prior_std=_EXACT)
+            scenario = with_known_start(dataclasses.replace(simulation.SCENARIOS[name], steps=steps))
             report["worlds"][name] = _world(scenario, runs, config.seed, lambda more, done=done: progress(done + more))
             done += runs * len(_WAYS)
     table = _table(report)

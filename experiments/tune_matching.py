@@ -8,21 +8,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import scenario_world
-from tune_sources import GATE_TEMPERATURE, Evidence, Source, Wanted
+from common import EXACT, GAP, scenario_world, with_known_start
+from tune_sources import GATE_TEMPERATURE, Evidence, Source, Wanted, judged_by_study
 
 from jaxlocmap import Gaussian, Params, simulation, tuning
-from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.matching.submaps import with_defaults
-from jaxlocmap.monte_carlo import monte_carlo
+from jaxlocmap.simulation.scenario import LOOP_CENTRE, LOOP_RADIUS
 from jaxlocmap.simulation.world import random_room
 from jaxlocmap.types import Matcher
 
 MATCHING_NOISE = ("v", "w", "match_std", "match_scale", "map_length")
-MATCHER = Matcher(period=5, gap=0.8)  # the ends of the course's 61 beams lie far apart
+MATCHER = Matcher(period=5, gap=GAP)
 _STEPS = 300  # of a drive: some six submaps
-_EXACT = (1e-3, 1e-3, 1e-3)  # m, m, rad: the start is known
-_CIRCLE, _CLEAR = ((6.0, 5.4), 3.0), 0.4  # m: what the loop drives, and how far from it the box of a room must stand
+_CLEAR = 0.4  # m: how far from the circle of the loop the box of a room must stand
 _JUDGES = (dataclasses.replace(simulation.LOOP, steps=2400), simulation.BUILDING)
 
 
@@ -38,7 +36,7 @@ def from_drawn_worlds(motion: str, runs: int, judge_runs: int, wanted: Wanted) -
         rooms, buildings = in_rooms(of_rooms, count // 2, steps), in_buildings(of_buildings, count - count // 2, steps)
         return tuning.join(rooms, buildings)
 
-    judges = [_known_start(dataclasses.replace(x, steps=200) if wanted.quick else x) for x in _JUDGES]
+    judges = [with_known_start(dataclasses.replace(x, steps=200) if wanted.quick else x) for x in _JUDGES]
 
     def evidence(params: Params) -> Evidence:
         return {judge.name: _studied(judge, params, noise, motion, judge_runs, key, wanted) for judge in judges}
@@ -59,15 +57,15 @@ def from_drawn_worlds(motion: str, runs: int, judge_runs: int, wanted: Wanted) -
 
 def in_rooms(key: jax.Array, count: int, steps: int) -> tuning.Batch:
     """Drives of the loop in rooms of which each has its box elsewhere, clear of the circle driven."""
-    (centre, radius), (of_rooms, of_drives) = _CIRCLE, jax.random.split(key)
+    of_rooms, of_drives = jax.random.split(key)
     rooms = jax.vmap(random_room)(jax.random.split(of_rooms, 40 * count))  # a third of them will do
-    box = np.asarray(rooms.segments)[:, 4:].reshape(40 * count, -1, 2) - centre
+    box = np.asarray(rooms.segments)[:, 4:].reshape(40 * count, -1, 2) - LOOP_CENTRE
     low, high = box.min(axis=1), box.max(axis=1)
     nearest = np.linalg.norm(np.maximum(np.maximum(low, -high), 0), axis=1)
     farthest = np.linalg.norm(np.maximum(-low, high), axis=1)
-    clear = np.flatnonzero((nearest > radius + _CLEAR) | (farthest < radius - _CLEAR))[:count]
+    clear = np.flatnonzero((nearest > LOOP_RADIUS + _CLEAR) | (farthest < LOOP_RADIUS - _CLEAR))[:count]
     worlds = simulation.World(rooms.segments[clear], jnp.zeros((count, 0, 2)))
-    scenario = _known_start(dataclasses.replace(simulation.LOOP, steps=steps))
+    scenario = with_known_start(dataclasses.replace(simulation.LOOP, steps=steps))
     noise = simulation.Noise()
     return tuning.simulated(of_drives, count, worlds, noise, scenario=scenario, scans=True, worlds=True)
 
@@ -76,19 +74,15 @@ def in_buildings(key: jax.Array, count: int, steps: int) -> tuning.Batch:
     """Drives through buildings, each from another place on: one after the other along the tour."""
     of_worlds, of_drives = jax.random.split(key)
     a_round = simulation.BUILDING.steps // 3
-    scenario = _known_start(dataclasses.replace(simulation.RANDOM_BUILDING, steps=a_round))
+    scenario = with_known_start(dataclasses.replace(simulation.RANDOM_BUILDING, steps=a_round))
     worlds = jax.vmap(simulation.random_building)(jax.random.split(of_worlds, count))
     noise = simulation.Noise()
     whole = tuning.simulated(of_drives, count, worlds, noise, scenario=scenario, scans=True, worlds=True)
     truth = np.asarray(whole.truth)
-    known = np.broadcast_to(np.diag(np.square(_EXACT)), (*truth.shape, truth.shape[-1]))
+    known = np.broadcast_to(np.diag(np.square(EXACT)), (*truth.shape, truth.shape[-1]))
     pieces = tuning.windows(whole, steps, run_in=0, beliefs=Gaussian(jnp.asarray(truth), jnp.asarray(known)))
     per_round = -(-a_round // steps)
     return tuning.pick(pieces, np.arange(count) * per_round + np.arange(count) % per_round)
-
-
-def _known_start(scenario: simulation.Scenario) -> simulation.Scenario:
-    return dataclasses.replace(scenario, exact_prior=False, prior_std=_EXACT)
 
 
 def _studied(
@@ -104,7 +98,5 @@ def _studied(
     config = scenario.config(motion=motion, gate_probability=wanted.judge_gate, grid=False)
     config = dataclasses.replace(config, matcher=MATCHER)
     world = scenario_world(scenario)
-    args = params, world._replace(landmarks=world.landmarks[:0]), noise, scenario.prior()
-    args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), args)
-    totals = monte_carlo(Study(scenario, config), jax.random.fold_in(key, 3), runs, *args)
-    return summarise(totals.value, config)
+    world = world._replace(landmarks=world.landmarks[:0])
+    return judged_by_study(jax.random.fold_in(key, 3), runs, params, world, noise, scenario=scenario, config=config)

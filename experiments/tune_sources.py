@@ -80,10 +80,8 @@ def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wa
     study_runs = min(judge_runs, 200) if mapping else judge_runs
 
     def evidence(params: Params) -> Evidence:
-        args = params, simulation.room(), noise, scenario.prior()
-        args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), args)
-        totals = monte_carlo(Study(scenario, study_config), jax.random.fold_in(key, 3), study_runs, *args)
-        report = summarise(totals.value, study_config)
+        fresh, room = jax.random.fold_in(key, 3), simulation.room()
+        report = judged_by_study(fresh, study_runs, params, room, noise, scenario=scenario, config=study_config)
         if held_out is not None:
             report["one_scan_ahead"] = _predictive_score(params, held_out, study_config)
         return report
@@ -104,6 +102,21 @@ def from_scenario(name: str, motion: str, runs: int, judge_runs: int, wanted: Wa
         evidence,
         scenario.dt,
     )
+
+
+def judged_by_study(
+    key: jax.Array,
+    runs: int,
+    params: Params,
+    world: simulation.World,
+    noise: simulation.Noise,
+    *,
+    scenario: simulation.Scenario,
+    config: Config,
+) -> Evidence:
+    """The report of a study of fresh runs, in float32, as studies are made."""
+    args = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (params, world, noise, scenario.prior()))
+    return summarise(monte_carlo(Study(scenario, config), key, runs, *args).value, config)
 
 
 def from_robots(

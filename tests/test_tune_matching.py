@@ -18,6 +18,7 @@ from jaxlocmap.matching.submaps import with_defaults
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import tune
 import tune_matching
+import tune_sources
 from tune_sources import Wanted
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
@@ -74,21 +75,16 @@ def test_what_is_tuned_on_validated_and_judged(monkeypatch):
     for name in ("in_rooms", "in_buildings"):
         monkeypatch.setattr(tune_matching, name, lambda *args, name=name: batches(name, *args) or (name, args[1]))
     monkeypatch.setattr(tune_matching.tuning, "join", lambda *parts: parts)
-    monkeypatch.setattr(tune_matching, "monte_carlo", studies)
-    monkeypatch.setattr(tune_matching, "summarise", lambda totals, config: {"anees": 3.0, "of": config})
+    monkeypatch.setattr(tune_sources, "monte_carlo", studies)
+    monkeypatch.setattr(tune_sources, "summarise", lambda totals, config: {"anees": 3.0, "of": config})
     source = tune_matching.from_drawn_worlds("euler", 9, 70, WANTED)
     assert source.train == source.compared == (("in_rooms", 4), ("in_buildings", 5))
     assert source.validation == (("in_rooms", 1), ("in_buildings", 1))
     assert len({np.asarray(jax.random.key_data(args[1])).tobytes() for args, _ in batches.calls}) == 4
     assert {args[3] for args, _ in batches.calls} == {300}
     config = source.config
-    assert (config.motion, config.gate_probability, config.gate_temperature, config.grid) == (
-        "euler",
-        0.9999,
-        2.0,
-        None,
-    )
-    assert config.matcher == tune_matching.MATCHER
+    assert (config.motion, config.gate_probability, config.gate_temperature) == ("euler", 0.9999, 2.0)
+    assert (config.grid, config.matcher) == (None, tune_matching.MATCHER)
     assert source.start.blocks.keys() == {"match_std", "match_scale", "map_length"}
     evidence = source.evidence(source.start)
     assert list(evidence) == ["loop", "building"]

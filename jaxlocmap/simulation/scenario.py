@@ -175,17 +175,17 @@ def _capstone_command(k: jax.Array, pose: jax.Array) -> jax.Array:
     return jnp.stack([0.35 + 0.05 * jnp.sin(0.05 * k), 0.25 * jnp.sin(0.03 * k)])
 
 
-_LOOP_CENTRE, _LOOP_RADIUS, _LOOP_STEPS = (6.0, 5.4), 3.0, 600  # m, m, steps a lap
+LOOP_CENTRE, LOOP_RADIUS, _LOOP_STEPS = (6.0, 5.4), 3.0, 600  # m, m, steps a lap
 
 
 def _loop_command(k: jax.Array, pose: jax.Array) -> jax.Array:
     """Round a circle, steered by the true pose, so that the drive stays in free space however long it lasts."""
     del k
-    dx, dy = pose[0] - _LOOP_CENTRE[0], pose[1] - _LOOP_CENTRE[1]
-    outside = jnp.hypot(dx, dy) - _LOOP_RADIUS
+    dx, dy = pose[0] - LOOP_CENTRE[0], pose[1] - LOOP_CENTRE[1]
+    outside = jnp.hypot(dx, dy) - LOOP_RADIUS
     off_course = wrap(pose[2] - arctan2(dy, dx) - jnp.pi / 2)
-    v = 2 * jnp.pi * _LOOP_RADIUS / (_LOOP_STEPS * 0.1)
-    return jnp.stack([jnp.asarray(v, pose.dtype), v / _LOOP_RADIUS + 0.5 * outside - 1.0 * off_course])
+    v = 2 * jnp.pi * LOOP_RADIUS / (_LOOP_STEPS * 0.1)
+    return jnp.stack([jnp.asarray(v, pose.dtype), v / LOOP_RADIUS + 0.5 * outside - 1.0 * off_course])
 
 
 CAPSTONE = Scenario(name="capstone", steps=240, command=_capstone_command, start=(1.0, 1.0, 0.0))
