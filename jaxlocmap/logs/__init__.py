@@ -7,25 +7,29 @@ from typing import Any
 
 from jaxlocmap.logs.carmen import read_carmen
 from jaxlocmap.logs.mrclam import read_mrclam
+from jaxlocmap.logs.pose_graph import GraphFile, chained, read_graph, write_g2o
 from jaxlocmap.logs.record import Log
 from jaxlocmap.logs.relations import RelationErrors, Relations, read_relations, relation_errors, revisits
 from jaxlocmap.logs.timeline import MAX_GAP, Timeline, to_timeline
-from jaxlocmap.logs.trajectory import Pairs, Trajectory, pair, read_innovations, read_trajectory
+from jaxlocmap.logs.trajectory import Pairs, Trajectory, pair, read_innovations, read_trajectory, write_csv
 from jaxlocmap.logs.tum import write_tum
 from jaxlocmap.logs.woods import read_woods
 
 __all__ = [
     "FORMATS",
     "MAX_GAP",
+    "GraphFile",
     "Log",
     "Pairs",
     "RelationErrors",
     "Relations",
     "Timeline",
     "Trajectory",
+    "chained",
     "pair",
     "read",
     "read_carmen",
+    "read_graph",
     "read_innovations",
     "read_mrclam",
     "read_relations",
@@ -34,6 +38,8 @@ __all__ = [
     "relation_errors",
     "revisits",
     "to_timeline",
+    "write_csv",
+    "write_g2o",
     "write_tum",
 ]
 

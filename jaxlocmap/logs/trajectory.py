@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxlocmap import files
+from jaxlocmap import checks, files
 from jaxlocmap.logs.text import LARGEST, lines, numbers
 from jaxlocmap.logs.timeline import backward, check_overlap, interpolate, last_at_each_stamp
 
@@ -124,6 +124,29 @@ def pair(
                 counts[key] += count
     time = max((estimate.time for estimate in estimates), key=len)
     return Pairs(time - time[0], truth, mean, cov, valid, tuple(e.time for e in estimates), counts)
+
+
+def write_csv(path: str | Path, time: np.ndarray, pose: np.ndarray, cov: np.ndarray) -> None:
+    """Write poses with covariances, one `t,x,y,theta,xx,xy,xt,yy,yt,tt` a line below those names, each number so that
+    it reads back exactly.
+
+    Args:
+        path: of the file to write.
+        time: (T,) s.
+        pose: (T, 3) m, m, rad.
+        cov: (T, 3, 3) m², m rad, rad².
+
+    Raises:
+        ValueError: a wrong shape, or no pose.
+    """
+    time, pose, cov = (np.asarray(x, np.float64) for x in (time, pose, cov))
+    checks.shapes(time=(time, (None,)), pose=(pose, (len(time), 3)), cov=(cov, (len(time), 3, 3)))
+    if not len(time):
+        raise ValueError("time: expected at least one pose, got none")
+    upper = cov[:, *np.triu_indices(3)]
+    rows = np.column_stack([time, pose, upper]).tolist()
+    names = ["t", "x", "y", "theta", *_UPPER]
+    files.write(path, "".join(",".join(row) + "\n" for row in [names, *([repr(x) for x in row] for row in rows)]))
 
 
 def read_innovations(path: str | Path, stamps: np.ndarray) -> dict[str, np.ndarray]:

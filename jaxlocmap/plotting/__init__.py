@@ -1,5 +1,6 @@
 """Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. Nowhere else: matplotlib."""
 
+from jaxlocmap.plotting.graphs import graph_figure
 from jaxlocmap.plotting.maps import map_figure, trajectory_figure
 from jaxlocmap.plotting.studies import (
     judge_figure,
@@ -18,6 +19,7 @@ from jaxlocmap.plotting.tuning import (
 __all__ = [
     "calibration_figure",
     "descent_figure",
+    "graph_figure",
     "judge_figure",
     "log_before_after_figure",
     "map_figure",

@@ -43,7 +43,7 @@ def trajectory_figure(
         ax.plot(truth[:, 0], truth[:, 1], color=TRUTH, lw=1.5, label="truth")
     ax.plot(estimate[:, 0], estimate[:, 1], color=ESTIMATE, lw=1, label="estimate")
     ax.plot(landmarks[:, 0], landmarks[:, 1], "*", color=EXPECTED, ms=10, label="landmarks")
-    _ellipses(ax, estimate, cov, probability, ellipses)
+    ellipses_of_position(ax, estimate, cov, probability, ellipses)
     ax.set(xlabel="x [m]", ylabel="y [m]", title=title)
     ax.set_aspect("equal", adjustable="datalim")  # a straight drive would leave no height
     figure.legend(fontsize=8, loc="outside lower center", ncols=5)
@@ -82,7 +82,7 @@ def map_figure(
         ax.plot(truth[:, 0], truth[:, 1], color=EXPECTED, lw=1.5, label="truth")
     ax.plot(poses[:, 0], poses[:, 1], color=ESTIMATE, lw=1, label="path the map was made from")
     if cov is not None:
-        _ellipses(ax, poses, cov, 0.95, 25)
+        ellipses_of_position(ax, poses, cov, 0.95, 25)
     seen_rows, seen_columns = np.nonzero(log_odds)
     if len(seen_rows):  # the picture shows what was seen, with a margin
         margin = 0.05 * max(np.ptp(seen_rows), np.ptp(seen_columns), 10)
@@ -93,7 +93,8 @@ def map_figure(
     save(figure, path, dpi=150)
 
 
-def _ellipses(ax: Axes, mean: np.ndarray, cov: np.ndarray, probability: float, count: int) -> None:
+def ellipses_of_position(ax: Axes, mean: np.ndarray, cov: np.ndarray, probability: float, count: int) -> None:
+    """Ellipses that hold the position with a probability, at `count` of the poses (T, 3) with covariances (T, 3, 3)."""
     reach = math.sqrt(chi2_quantile(probability, 2))
     label = f"{100 * probability:.0f} % ellipses of the position"
     for k in np.linspace(0, len(mean) - 1, count).astype(int):
