@@ -63,7 +63,7 @@ class MatchReport(NamedTuple):
     used: jax.Array  # () int32: those that lie on lines of the submap
     accepted: jax.Array  # () bool
     submap: jax.Array  # () int32: number of the submap matched on, from 0
-    relative: Gaussian  # (3,), (3, 3) m, m, rad: the pose corrected, in the frame of that submap's anchor
+    relative: Gaussian  # (3,), (3, 3) m, m, rad: the pose, corrected or not, in the frame of that submap's anchor
     begun: jax.Array  # () bool: a younger submap begins, at this pose
     anew: jax.Array  # () bool: an older one does: the first of all, or after too many refusals
     finished: jax.Array  # () bool: the older one is finished, and the younger takes its place
@@ -250,7 +250,8 @@ def match_scan(
     refused = jnp.where(accepted, 0, submaps.refused + tried.astype(jnp.int32))
     submaps = travelled(submaps, before, belief.mean)
     relative = _between(belief, older, 0)
-    report = report._replace(accepted=accepted, relative=Gaussian(*(jnp.where(tried, x, 0) for x in relative)))
+    there = submaps.scans[0] > 0
+    report = report._replace(accepted=accepted, relative=Gaussian(*(jnp.where(there, x, 0) for x in relative)))
     if matcher.known_std is not None:
         belief = _other_place(belief, older, 1 - jnp.exp(-submaps.travel / length), matcher.known_std)
         return belief, submaps._replace(travel=jnp.zeros_like(submaps.travel), refused=refused), report
