@@ -31,7 +31,7 @@ from jaxlocmap.logs import (
     write_g2o,
     write_tum,
 )
-from jaxlocmap.logs.poses import between, compose, wrapped
+from jaxlocmap.poses import between, compose, wrapped
 from jaxlocmap.se2 import POSE
 
 _LISTED = 10  # loops that fit worst

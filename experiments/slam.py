@@ -25,13 +25,13 @@ from map_log import in_radians, make_map, ready
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, init, plotting, run
 from jaxlocmap.consistency import readable
 from jaxlocmap.logs import Log, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
-from jaxlocmap.logs.poses import between, compose, wrapped
 from jaxlocmap.logs.relations import Relations, pairs
 from jaxlocmap.mapping import quality
 from jaxlocmap.mapping.ros import save_map
 from jaxlocmap.matching import submaps
 from jaxlocmap.matching.storage import LoadedLines, load_lines, save_lines
 from jaxlocmap.monte_carlo.hosts import merge_kernels
+from jaxlocmap.poses import between, compose, wrapped
 from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Matcher
 

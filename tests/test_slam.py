@@ -16,7 +16,7 @@ from test_logs import write
 
 from jaxlocmap import Gaussian, Params, simulation
 from jaxlocmap.logs import read_trajectory, write_tum
-from jaxlocmap.logs.poses import between as moved
+from jaxlocmap.poses import between as moved
 from jaxlocmap.mapping.ros import load_map
 from jaxlocmap.matching.storage import load_lines
 

@@ -27,10 +27,13 @@ from jaxlocmap.graph.trail import Trail
 from jaxlocmap.matching import lines as line_grid
 from jaxlocmap.matching.normals import Points
 from jaxlocmap.matching.scan_match import match, search
-from jaxlocmap.se2 import POSE, between, boxminus
+from jaxlocmap.poses import between
+from jaxlocmap.se2 import POSE, boxminus
 from jaxlocmap.types import GridSpec
 
-_STEPS = 20  # of Gauss-Newton, a match
+_STEPS = 10  # of Gauss-Newton, a match
+_ROUND = 64  # loops
+_LEVELS = 4  # windows to choose from, each half as wide as the one before
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +102,7 @@ class Closed(NamedTuple):
     online: np.ndarray  # (N, 3) m, m, rad: each anchor as it was known when its submap was finished
 
 
-@functools.partial(jax.jit, static_argnames=("spec", "closure"))
+@functools.partial(jax.jit, static_argnames=("spec", "window", "most"))
 def register(
     points: Points,
     old: tuple[jax.Array, jax.Array],
@@ -111,7 +114,8 @@ def register(
     scale: jax.Array,
     *,
     spec: GridSpec,
-    closure: Closure,
+    window: tuple[float, float],
+    most: int,
 ) -> Registration:
     """Match the scans of a submap on the map of an older one.
 
@@ -124,7 +128,8 @@ def register(
         spread: (3, 3) covariance of how scans lie in the two submaps, added to that of the match.
         std, scale: () m, as of `scan_match.match`.
         spec: of the older map, static.
-        closure: static.
+        window: m, rad: how far to search, static.
+        most: points of the younger submap that are matched, about, static.
     """
     lines = jnp.zeros((*spec.shape, line_grid.SUMS), mean.dtype)
 
@@ -133,7 +138,7 @@ def register(
         return line_grid.add_points(lines, old[1][k], scan, spec=spec, counts=old[0][k] >= 0)
 
     lines = jax.lax.fori_loop(0, len(old[0]), drawn, lines)
-    every = max(1, len(new[0]) * points.xy.shape[1] // closure.points)
+    every = max(1, len(new[0]) * points.xy.shape[1] // most)
     seen = jax.tree.map(lambda x: x[jnp.maximum(new[0], 0), ::every], points)
     seen = seen._replace(valid=seen.valid & (new[0] >= 0)[:, None])
     placed = jax.vmap(line_grid.placed)(new[1], seen)
@@ -142,7 +147,7 @@ def register(
         jnp.stack([placed.normal_x.ravel(), placed.normal_y.ravel()], axis=-1),
         placed.valid.ravel(),
     )
-    start = search(lines, mean, cov + spread, query, scale, spec=spec, window=closure.window)
+    start = search(lines, mean, cov + spread, query, scale, spec=spec, window=window)
     found = match(lines, mean, cov + spread, query, std, scale, spec=spec, steps=_STEPS, start=start)
     fit = line_grid.fit(lines, found.pose, query, scale, spec=spec)
     count = jnp.maximum(found.points, 1).astype(mean.dtype)
@@ -236,16 +241,17 @@ def close_loops(
         if len(old):
             every = np.stack([np.arange(n), np.full(n, j)], axis=-1).astype(np.int32)
             apart = np.asarray(relative_covariances(whole, solution, jnp.asarray(every), method=method))[old]
-            means = np.asarray(jax.vmap(lambda a: between(a, solution.poses[j])[0])(solution.poses))[old]
+            means = between(poses[old], poses[j])
             for i in _nearest(scans, means, apart, j, closure):
                 spread = scans.spread[i] + scans.spread[j]
                 result = register(
                     points,
                     scans.old(i),
                     scans.new(j),
-                    *(jnp.asarray(x, dtype) for x in (means[i], apart[i], spread, std, scale)),
+                    *(np.asarray(x, dtype) for x in (means[i], apart[i], spread, std, scale)),
                     spec=spec,
-                    closure=closure,
+                    window=_window(apart[i] + spread, closure),
+                    most=closure.points,
                 )
                 result = Registration(*(np.asarray(x) for x in result))
                 good = bool(believed(result, closure))
@@ -259,8 +265,10 @@ def close_loops(
             if changed:
                 whole = graph(capacity)
         progress(j + 1)
-    final = graph(count)
-    tried = Registration(*(np.stack([getattr(f, name) for f in found]) for name in Registration._fields)) if found else None
+    final = graph(min(_rounded(count, _ROUND), capacity)) if count else graph(0)
+    tried = (
+        Registration(*(np.stack([getattr(f, name) for f in found]) for name in Registration._fields)) if found else None
+    )
     return Closed(
         final,
         solve(final, jnp.asarray(online) if n < 2 else None, kernel=kernel),
@@ -280,37 +288,48 @@ class _Scans:
             first = np.arange(trail.begun[k], self._new[k][0] if len(self._new[k]) else trail.begun[k])
             self._early.append(first[trail.drawn[first] & (trail.submap[first] == k - 1)] if k else first[:0])
         self._trail = trail
-        self._most_new = max(len(x) for x in self._new)
-        self._most_old = max(len(a) + len(b) for a, b in zip(self._new, self._early, strict=True))
+        self._most_new = _rounded(max(len(x) for x in self._new), 4)
+        self._most_old = _rounded(max(len(a) + len(b) for a, b in zip(self._new, self._early, strict=True)), 8)
         self.spread = np.stack(
             [trail.place_cov[x].mean(axis=0) if len(x) else np.zeros((POSE, POSE)) for x in self._new]
         )
         self.middle = np.stack([trail.place[x].mean(axis=0) if len(x) else np.zeros(POSE) for x in self._new])
 
-    def new(self, k: int) -> tuple[jax.Array, jax.Array]:
+    def new(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """Scans that were matched on submap k, and their places in its frame, filled up."""
         return _filled(self._new[k], self._trail.place[self._new[k]], self._most_new)
 
-    def old(self, k: int) -> tuple[jax.Array, jax.Array]:
+    def old(self, k: int) -> tuple[np.ndarray, np.ndarray]:
         """All scans drawn in submap k, and their places in its frame, filled up."""
         early = self._early[k]
         places = self._trail.place[self._new[k]]
         if len(early):
             edge = np.broadcast_to(self._trail.edge[k - 1], (len(early), POSE))
-            places = np.concatenate([_between(edge, self._trail.place[early]), places])
+            places = np.concatenate([between(edge, self._trail.place[early]), places])
         return _filled(np.concatenate([early, self._new[k]]), places, self._most_old)
 
 
-def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.asarray(jax.vmap(lambda a, b: between(a, b)[0])(jnp.asarray(a), jnp.asarray(b)))
+def _rounded(size: int, to: int) -> int:
+    """The next multiple: runs that differ a little share what was compiled for one."""
+    return -(-size // to) * to
 
 
-def _filled(index: np.ndarray, places: np.ndarray, size: int) -> tuple[jax.Array, jax.Array]:
+def _filled(index: np.ndarray, places: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     fill = size - len(index)
     return (
-        jnp.asarray(np.concatenate([index, np.full(fill, -1)]), jnp.int32),
-        jnp.asarray(np.concatenate([places, np.zeros((fill, POSE))]), jnp.float32),
+        np.concatenate([index, np.full(fill, -1)]).astype(np.int32),
+        np.concatenate([places, np.zeros((fill, POSE))]).astype(np.float32),
     )
+
+
+def _window(cov: np.ndarray, closure: Closure) -> tuple[float, float]:
+    """The least of a few windows that holds three standard deviations, or the widest; each is compiled once."""
+    sigma = np.sqrt(np.diagonal(cov))
+    for level in reversed(range(1, _LEVELS)):
+        across, turn = (w / 2**level for w in closure.window)
+        if 3 * max(sigma[:2]) <= across and 3 * sigma[2] <= turn:
+            return across, turn
+    return closure.window
 
 
 def _nearest(scans: _Scans, means: np.ndarray, covs: np.ndarray, j: int, closure: Closure) -> list[int]:

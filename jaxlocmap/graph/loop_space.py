@@ -70,6 +70,9 @@ class LoopSpace(NamedTuple):
         system, d = self.system, self.system.after.shape[1]
         a, b = pair[:, 0], pair[:, 1]
         apart = _upper(self.sums[b] + self.sums[a] - 2 * self.sums[jnp.minimum(a, b)], d)
+        apart = jnp.stack([jnp.stack(row, axis=-1) for row in apart.rows], axis=-2)
+        if not len(system.pair):
+            return apart
         across = []
         for end, sign in ((b, 1), (a, -1)):
             for loop_end, J in _ends(system):
@@ -80,9 +83,7 @@ class LoopSpace(NamedTuple):
         table = jnp.stack([jnp.stack(row, axis=-1) for row in rows.rows], axis=1)  # (L, r, K, d)
         table = jax.scipy.linalg.solve_triangular(self.factor, table.reshape(len(system.pair) * r, -1), lower=True)
         table = table.reshape(len(table), len(pair), d)
-        return jnp.stack([jnp.stack(row, axis=-1) for row in apart.rows], axis=-2) - jnp.einsum(
-            "lki,lkj->kij", table, table
-        )
+        return apart - jnp.einsum("lki,lkj->kij", table, table)
 
 
 def factorised(system: System) -> LoopSpace:

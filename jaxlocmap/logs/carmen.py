@@ -13,9 +13,9 @@ import numpy as np
 
 from jaxlocmap import files
 from jaxlocmap.logs.fan import Fan, check_fov, directions, fits
-from jaxlocmap.logs.poses import compose
 from jaxlocmap.logs.record import Log
 from jaxlocmap.logs.text import lines, numbers, whole
+from jaxlocmap.poses import compose
 
 _ASSUMED = math.pi  # rad, the field of view where nobody says one
 _IGNORED = {"NEFF", "SYNC"}

@@ -11,8 +11,8 @@ import numpy as np
 
 from jaxlocmap import checks, files
 from jaxlocmap.graph import Graph
-from jaxlocmap.logs.poses import compose
 from jaxlocmap.logs.text import lines, numbers, whole
+from jaxlocmap.poses import compose
 from jaxlocmap.se2 import POSE
 
 _VERTICES = ("VERTEX_SE2", "VERTEX2", "VERTEX")

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxlocmap import checks, files
-from jaxlocmap.logs.poses import between, wrapped
 from jaxlocmap.logs.text import lines, numbers
+from jaxlocmap.poses import between, wrapped
 
 _FIELDS = ("t1", "t2", "dx", "dy", "dz", "droll", "dpitch", "dyaw")
 _SAME_TIME = 1e-4  # s: stamps that agree to this are of one scan; the next one may come 5 ms later
