@@ -1,8 +1,10 @@
 """Localise a robot by its laser and wheels alone and map what it sees: every scan is matched on the map of those
-before.
+before, and where the robot comes back to a place, that closes a loop.
 
-One matching map, no loop closure: coming back to a place corrects the pose where the old walls are near enough to be
-matched, and the covariance, that of the pose since the start, takes nothing from it.
+The filter matches on submaps a few metres long. Finished ones are recognised in older ones, which makes a pose graph;
+its optimum is the trajectory, its covariances are those of the poses since the start, and the maps are drawn there.
+With --no-closure, or on a known map, there is one map without an end: coming back corrects the pose where the old walls
+are near enough to be matched, and the covariance takes nothing from it.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import numpy as np
 import tyro
 from common import CONSOLE, command_line, count_rows, in_pieces, output_folder, params_or, saved, show, write_report
 from map_log import in_radians, make_map, ready
+from slam_loops import closed, drawn, loop_doubts, loop_rows, write_loops
 
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, init, plotting, run
 from jaxlocmap.consistency import readable
@@ -35,6 +38,7 @@ from jaxlocmap.poses import between, compose, wrapped
 from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Matcher
 
+_ANY_SCANS = 2**30  # of a submap, whose travel ends it
 _PIECE = 91  # scans between two moves of the progress bar
 _OLDER = POSE  # entry of the state at which the anchor of the map begins
 _START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
@@ -64,6 +68,14 @@ class SlamConfig:
     """How far from the odometry a scan is searched at most, m, rad; less where the covariance is small."""
     half_width: float = 40.0
     """Of the matching map about the start, m: what lies beyond is not matched on."""
+    closure: bool = True
+    """Look for places seen before, and close the loops."""
+    submap_length: float = 5.0
+    """Of travel in a submap, m, a turn of a radian counted as half a metre."""
+    kernel: Literal["gnc", "quadratic", "huber", "cauchy", "geman_mcclure", "dcs"] = "gnc"
+    """How loops count that do not fit the others."""
+    online: bool = False
+    """Also write each pose as it was known when its submap was finished, before later loops."""
     max_range: float = 20.0
     """Ranges at or beyond are no walls, m."""
     fov: float | None = None
@@ -83,7 +95,8 @@ class SlamConfig:
     seed: int = 0
     """Nothing here is random; every program has it."""
     out: Path = Path("out/slam")
-    """Folder for estimate.tum, map.pgm, map.yaml, map.png, lines.npz and report.json."""
+    """Folder for estimate.tum, map.pgm, map.yaml, map.png, lines.npz and report.json; and of closed loops graph.g2o,
+    poses.csv, graph.png and, if asked for, online.tum."""
     quick: bool = False
     """The first 91 scans alone."""
 
@@ -103,20 +116,33 @@ def main(config: SlamConfig) -> dict[str, Any]:
     params = params_or(config.params, believed(config))
     settings = settings_of(config, log, known)
     CONSOLE.print(f"{len(log.scan)} scans of {log.scan.shape[1]} beams; compiling takes some seconds")
+    began = time.perf_counter()
     info, state, took = match_log(params, log, settings, config.start, known)
-    poses, cov = on_the_map(info)
+    loops = closed(params, log, info, settings, config) if closes(config) else None
+    poses, cov = on_the_map(info) if loops is None else (loops.poses, loops.cov)
     report = judge(log, info, settings, poses, cov)
     report["counts"] = {**log.counts, "repeated_stamps": repeated}
     report |= took | {"params": params.numbers()}
     report |= {name: _errors(log.scan_time, poses, relations) for name, relations in scored.items()}
-    report |= _write(out, config, log, poses, cov, state, settings, params)
+    names = _write(out, config, log, poses, cov, settings, params, report)
+    if loops is None:
+        lines = None if state.submaps is None or known else np.asarray(state.submaps.lines)
+    else:
+        names += write_loops(out, loops, log, report)
+        if config.online:
+            write_tum(out / "online.tum", log.scan_time, loops.online)
+            names.append("online.tum")
+        lines = drawn(log, settings, poses, info.match.accepted | info.match.anew, config.half_width)
+    if lines is not None and settings.matcher is not None:
+        save_lines(out / "lines.npz", lines, dataclasses.replace(settings.matcher, half_width=config.half_width))
+        names.append("lines.npz")
+    report["wall_s"] = time.perf_counter() - began
     report["careful"] = said = doubts(report, config)
     write_report(out, report)
     for sentence in said:
         CONSOLE.print(f"careful: {sentence}", soft_wrap=True)
     _show(log.name, report)
-    names = ["estimate.tum", "map.pgm", "map.yaml", "map.png", "report.json"]
-    saved(out, *names, *([] if known else ["lines.npz"]))
+    saved(out, *names, "report.json")
     return report
 
 
@@ -125,7 +151,7 @@ def _check(config: SlamConfig) -> None:
     for name in ("start", "laser_offset"):
         if not np.all(np.isfinite(getattr(config, name))):
             raise ValueError(f"{name}: expected three finite numbers, got {getattr(config, name)}")
-    for name in ("max_range", "resolution"):
+    for name in ("max_range", "resolution", "submap_length"):
         if not 0 < getattr(config, name) < math.inf:
             raise ValueError(f"{name}: expected metres > 0, got {getattr(config, name)}")
     in_radians(config.fov)
@@ -153,16 +179,25 @@ def _scored(config: SlamConfig, log: Log) -> dict[str, Relations]:
     return scored
 
 
+def closes(config: SlamConfig) -> bool:
+    """Whether loops are looked for."""
+    return config.closure and config.map is None
+
+
 def believed(config: SlamConfig) -> Params:
     return submaps.with_defaults(Params.from_std(odometry=config.odometry))
 
 
 def settings_of(config: SlamConfig, log: Log, known: LoadedLines | None) -> Config:
-    """One map without an end, or one that is known."""
+    """Submaps, one map without an end, or one that is known."""
+    reach = min(config.max_range, log.scan_max_range)
+    submap = closes(config)
+    half_width = reach + 2 * config.submap_length if submap else config.half_width
     matcher = Matcher(
-        submap_scans=None,
+        submap_scans=_ANY_SCANS if submap else None,
+        submap_length=config.submap_length,
         resolution=0.1 if known is None else known.resolution,
-        half_width=config.half_width if known is None else known.half_width,
+        half_width=half_width if known is None else known.half_width,
         steps=20,
         window=config.window,
         least_share=_LEAST_SHARE[known is not None],
@@ -172,7 +207,7 @@ def settings_of(config: SlamConfig, log: Log, known: LoadedLines | None) -> Conf
         dt=1.0,  # a scan, whatever time it took: the noise of the odometry grows with the way
         motion="odometry",
         matcher=matcher,
-        max_range=min(config.max_range, log.scan_max_range),
+        max_range=reach,
         scanner_offset=config.laser_offset,
     )
 
@@ -278,7 +313,7 @@ def doubts(report: Mapping[str, Any], config: SlamConfig) -> list[str]:
         said.append(f"matches lie {report['nis_mean']:.1f} from the odometry (3 expected): --odometry is too small")
     if report["flagged"]:
         said.append(f"{report['flagged']} steps are flagged: odometry that is not finite, or no covariance")
-    return said
+    return said + loop_doubts(report)
 
 
 def _errors(time: np.ndarray, poses: np.ndarray, relations: Relations) -> dict[str, Any]:
@@ -301,21 +336,21 @@ def _write(
     log: Log,
     poses: np.ndarray,
     cov: np.ndarray,
-    state: State,
     settings: Config,
     params: Params,
-) -> dict[str, Any]:
-    """The trajectory, the occupancy map made at its poses, the map of lines; what the report says of them."""
+    report: dict[str, Any],
+) -> list[str]:
+    """The trajectory, and the occupancy map made at its poses; the names of what was written."""
     write_tum(out / "estimate.tum", log.scan_time, poses)
     seen = dataclasses.replace(log, truth=compose(poses, config.laser_offset), truth_time=log.scan_time)
     local, spec, mapping = ready(seen, config.resolution, config.max_range)
     log_odds, _, _ = make_map(params, local, mapping)
     cells = save_map(out, log_odds, spec, name="map")
-    title = f"{log.name}: {len(poses)} scans matched one after the other, cells of {config.resolution:g} m"
+    how = "with loops closed" if closes(config) else "matched one after the other"
+    title = f"{log.name}: {len(poses)} scans {how}, cells of {config.resolution:g} m"
     plotting.map_figure(out / "map.png", log_odds, spec, poses, cov=cov, title=title)
-    if config.map is None and settings.matcher is not None and state.submaps is not None:
-        save_lines(out / "lines.npz", np.asarray(state.submaps.lines), settings.matcher)
-    return {"entropy_bits": float(quality.entropy_bits(jnp.asarray(log_odds))), "shape": list(cells.shape)}
+    report |= {"entropy_bits": float(quality.entropy_bits(jnp.asarray(log_odds))), "shape": list(cells.shape)}
+    return ["estimate.tum", "map.pgm", "map.yaml", "map.png"]
 
 
 def _show(name: str, report: Mapping[str, Any]) -> None:
@@ -330,6 +365,8 @@ def _show(name: str, report: Mapping[str, Any]) -> None:
         ("1 sigma since the start, at the end", f"{report['sigma_position_end_m']:.3f} m", ""),
         ("a scan, compilation", f"{report['ms_per_scan']:.2f} ms, {report['compile_s']:.1f} s", ""),
         ("entropy of the map", f"{report['entropy_bits']:.0f} bits", ""),
+        *loop_rows(report),
+        ("seconds in all", f"{report['wall_s']:.1f}", ""),
     ]
     for kind in ("relations", "revisits"):
         if kind in report:

@@ -16,9 +16,9 @@ from test_logs import write
 
 from jaxlocmap import Gaussian, Params, simulation
 from jaxlocmap.logs import read_trajectory, write_tum
-from jaxlocmap.poses import between as moved
 from jaxlocmap.mapping.ros import load_map
 from jaxlocmap.matching.storage import load_lines
+from jaxlocmap.poses import between as moved
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import slam

@@ -7,7 +7,6 @@ which is drawn again from its scans. Where to look, and how far, is what the gra
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -19,21 +18,19 @@ import numpy as np
 from jaxlocmap import checks
 from jaxlocmap.filters import ekf
 from jaxlocmap.graph import methods
-from jaxlocmap.graph.covariance import relative_covariances
-from jaxlocmap.graph.factors import Graph
+from jaxlocmap.graph.covariance import marginals, relative_covariances
+from jaxlocmap.graph.factors import Graph, dead_reckoning
 from jaxlocmap.graph.kernels import Kernel
+from jaxlocmap.graph.registration import Registration, SubmapScans, register
 from jaxlocmap.graph.solver import Solution, solve
 from jaxlocmap.graph.trail import Trail
-from jaxlocmap.matching import lines as line_grid
 from jaxlocmap.matching.normals import Points
-from jaxlocmap.matching.scan_match import match, search
-from jaxlocmap.poses import between
-from jaxlocmap.se2 import POSE, boxminus
+from jaxlocmap.poses import between, compose, wrapped
+from jaxlocmap.se2 import POSE
 from jaxlocmap.types import GridSpec
 
-_STEPS = 10  # of Gauss-Newton, a match
-_ROUND = 64  # loops
 _LEVELS = 4  # windows to choose from, each half as wide as the one before
+_ROUND = 64  # the loops of a graph are filled up to a multiple, so that few sizes are compiled
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,18 +70,6 @@ class Closure:
             raise ValueError(f"Closure.window: expected two finite numbers > 0, m and rad, got {self.window}")
 
 
-class Registration(NamedTuple):
-    """What matching a submap on an older one found."""
-
-    moved: jax.Array  # (3,) m, m, rad: the younger anchor in the frame of the older one, by the scans alone
-    cov: jax.Array  # (3, 3) of it: of the match, and of how the scans lie in either submap
-    correlation: jax.Array  # () share of the points that lie on lines, each by its weight
-    share: jax.Array  # () share of the points that lie on lines
-    std: jax.Array  # () m, of the place matched, in its worst direction, from the points alone
-    nis: jax.Array  # () squared Mahalanobis distance from what the graph expects
-    converged: jax.Array  # () bool
-
-
 class Attempts(NamedTuple):
     """All loops that were looked for, K of them. NumPy."""
 
@@ -96,76 +81,10 @@ class Attempts(NamedTuple):
 class Closed(NamedTuple):
     """A trail whose loops are closed."""
 
-    graph: Graph  # its loops are the attempts that were accepted
+    graph: Graph  # its loops are the attempts that were accepted, in their order, and some without information
     solution: Solution
     attempts: Attempts
     online: np.ndarray  # (N, 3) m, m, rad: each anchor as it was known when its submap was finished
-
-
-@functools.partial(jax.jit, static_argnames=("spec", "window", "most"))
-def register(
-    points: Points,
-    old: tuple[jax.Array, jax.Array],
-    new: tuple[jax.Array, jax.Array],
-    mean: jax.Array,
-    cov: jax.Array,
-    spread: jax.Array,
-    std: jax.Array,
-    scale: jax.Array,
-    *,
-    spec: GridSpec,
-    window: tuple[float, float],
-    most: int,
-) -> Registration:
-    """Match the scans of a submap on the map of an older one.
-
-    Args:
-        points: of all S scans, (S, B, ...).
-        old: (A,) int32 scans of the older submap, -1 for none, and (A, 3) their places in its frame.
-        new: (C,) and (C, 3) those of the younger one.
-        mean: (3,) m, m, rad: the younger anchor in the frame of the older one, as the graph has it.
-        cov: (3, 3) its covariance.
-        spread: (3, 3) covariance of how scans lie in the two submaps, added to that of the match.
-        std, scale: () m, as of `scan_match.match`.
-        spec: of the older map, static.
-        window: m, rad: how far to search, static.
-        most: points of the younger submap that are matched, about, static.
-    """
-    lines = jnp.zeros((*spec.shape, line_grid.SUMS), mean.dtype)
-
-    def drawn(k: jax.Array, lines: jax.Array) -> jax.Array:
-        scan = jax.tree.map(lambda x: x[jnp.maximum(old[0][k], 0)], points)
-        return line_grid.add_points(lines, old[1][k], scan, spec=spec, counts=old[0][k] >= 0)
-
-    lines = jax.lax.fori_loop(0, len(old[0]), drawn, lines)
-    every = max(1, len(new[0]) * points.xy.shape[1] // most)
-    seen = jax.tree.map(lambda x: x[jnp.maximum(new[0], 0), ::every], points)
-    seen = seen._replace(valid=seen.valid & (new[0] >= 0)[:, None])
-    placed = jax.vmap(line_grid.placed)(new[1], seen)
-    query = Points(
-        jnp.stack([placed.x.ravel(), placed.y.ravel()], axis=-1),
-        jnp.stack([placed.normal_x.ravel(), placed.normal_y.ravel()], axis=-1),
-        placed.valid.ravel(),
-    )
-    start = search(lines, mean, cov + spread, query, scale, spec=spec, window=window)
-    found = match(lines, mean, cov + spread, query, std, scale, spec=spec, steps=_STEPS, start=start)
-    fit = line_grid.fit(lines, found.pose, query, scale, spec=spec)
-    count = jnp.maximum(found.points, 1).astype(mean.dtype)
-    # Away from what the graph expects again, to where the scans alone would have it.
-    information = found.information + jnp.diag(jnp.full(POSE, 1.0, mean.dtype))
-    alone = found.pose + jnp.linalg.solve(information, found.score)
-    of_match = jnp.linalg.inv(information)
-    total = of_match + spread
-    off = boxminus(alone, mean)
-    return Registration(
-        moved=alone,
-        cov=(total + total.T) / 2,
-        correlation=jnp.sum(fit.weight) / count,
-        share=found.used.astype(mean.dtype) / count,
-        std=jnp.sqrt(jnp.linalg.eigvalsh(of_match[:2, :2])[-1]),
-        nis=off @ jnp.linalg.solve(total + cov, off),
-        converged=found.converged,
-    )
 
 
 def believed(found: Registration, closure: Closure) -> np.ndarray:
@@ -187,6 +106,7 @@ def close_loops(
     *,
     spec: GridSpec,
     closure: Closure,
+    first: np.ndarray | None = None,
     kernel: Kernel | str = "gnc",
     progress: Callable[[int], None] = lambda done: None,
 ) -> Closed:
@@ -199,127 +119,110 @@ def close_loops(
         std, scale: m, as of `scan_match.match`.
         spec: of a submap's map, static.
         closure: how.
+        first: (3,) m, m, rad, of the first anchor; the origin by default.
         kernel: of the loops at the end; on the way they count in full, as the gate let them in.
         progress: told how many submaps are done.
 
     Source: Hess, Kohler, Rapp & Andor 2016 (submaps); Olson 2009 (correlative matching); Neira & Tardós 2001 (gates by
     joint covariances).
+
+    Raises:
+        ValueError: a trail without submaps.
     """
     n = trail.submaps
-    scans = _Scans(trail)
-    capacity = max(n * closure.candidates, 1)
-    pair = np.tile(np.array([[0, 1]], np.int32), (capacity, 1))
-    loop, information = np.zeros((capacity, POSE)), np.zeros((capacity, POSE, POSE))
-    odometry, odometry_information = jnp.asarray(trail.edge), jnp.asarray(np.linalg.inv(trail.edge_cov))
+    if not n:
+        raise ValueError("trail: expected at least one submap, got none: no scan had points enough")
+    scans, growing = SubmapScans(trail), _Growing(trail, closure)
+    begin = jnp.zeros(POSE) if first is None else jnp.asarray(first)
     dtype = points.xy.dtype
-    attempts: list[tuple[int, int]] = []
+    pairs: list[tuple[int, int]] = []
     found: list[Registration] = []
     accepted: list[bool] = []
     online = np.zeros((n, POSE))
-    count, changed, solution = 0, True, None
-
-    def graph(size: int) -> Graph:
-        return Graph(
-            odometry,
-            odometry_information,
-            jnp.asarray(pair[:size], jnp.int32),
-            jnp.asarray(loop[:size]),
-            jnp.asarray(information[:size]),
-        )
-
-    whole = graph(capacity)
+    whole = growing.graph(growing.most)
     method = methods.resolve(None, whole)
+    solution = solve(whole, dead_reckoning(whole, begin), method=method)
     for j in range(n):
-        if n < 2:
-            break
-        if changed or solution is None:
-            solution = solve(whole, None if solution is None else solution.poses, method=method)
-            changed = False
-        poses = np.asarray(solution.poses)
+        poses = np.asarray(solution.poses, np.float64)
         online[j] = poses[j]
+        before = growing.count
         old = np.arange(max(j - closure.apart + 1, 0))
         if len(old):
+            # Of all submaps, so that one program serves.
             every = np.stack([np.arange(n), np.full(n, j)], axis=-1).astype(np.int32)
-            apart = np.asarray(relative_covariances(whole, solution, jnp.asarray(every), method=method))[old]
+            apart = np.asarray(relative_covariances(whole, solution, jnp.asarray(every), method=method), np.float64)[
+                old
+            ]
             means = between(poses[old], poses[j])
             for i in _nearest(scans, means, apart, j, closure):
                 spread = scans.spread[i] + scans.spread[j]
                 result = register(
                     points,
-                    scans.old(i),
-                    scans.new(j),
+                    scans.map(i),
+                    scans.query(j),
                     *(np.asarray(x, dtype) for x in (means[i], apart[i], spread, std, scale)),
                     spec=spec,
                     window=_window(apart[i] + spread, closure),
                     most=closure.points,
                 )
-                result = Registration(*(np.asarray(x) for x in result))
-                good = bool(believed(result, closure))
-                attempts.append((i, j))
+                result = jax.tree.map(np.asarray, result)
+                pairs.append((i, j))
                 found.append(result)
-                accepted.append(good)
-                if good:
-                    pair[count], loop[count] = (i, j), result.moved
-                    information[count] = np.linalg.inv(np.asarray(result.cov, np.float64))
-                    count, changed = count + 1, True
-            if changed:
-                whole = graph(capacity)
+                accepted.append(bool(believed(result, closure)))
+                if accepted[-1]:
+                    growing.add(i, j, result)
+        if growing.count > before:
+            whole = growing.graph(growing.most)
+            solution = solve(whole, solution.poses, method=method)
         progress(j + 1)
-    final = graph(min(_rounded(count, _ROUND), capacity)) if count else graph(0)
-    tried = (
-        Registration(*(np.stack([getattr(f, name) for f in found]) for name in Registration._fields)) if found else None
-    )
+    final = growing.graph(min(-(-growing.count // _ROUND) * _ROUND, growing.most))
     return Closed(
         final,
-        solve(final, jnp.asarray(online) if n < 2 else None, kernel=kernel),
-        Attempts(np.array(attempts, int).reshape(-1, 2), tried, np.array(accepted, bool)),  # type: ignore[arg-type]
+        solve(final, dead_reckoning(final, begin), kernel=kernel),
+        Attempts(np.array(pairs, int).reshape(-1, 2), _stacked(found), np.array(accepted, bool)),
         online,
     )
 
 
-class _Scans:
-    """Which scans are drawn in each submap, and where."""
+class _Growing:
+    """The graph of a trail, with room for loops."""
 
-    def __init__(self, trail: Trail) -> None:
-        n = trail.submaps
-        self._new: list[np.ndarray] = [np.flatnonzero(trail.drawn & (trail.submap == k)) for k in range(n)]
-        self._early: list[np.ndarray] = []
-        for k in range(n):
-            first = np.arange(trail.begun[k], self._new[k][0] if len(self._new[k]) else trail.begun[k])
-            self._early.append(first[trail.drawn[first] & (trail.submap[first] == k - 1)] if k else first[:0])
-        self._trail = trail
-        self._most_new = _rounded(max(len(x) for x in self._new), 4)
-        self._most_old = _rounded(max(len(a) + len(b) for a, b in zip(self._new, self._early, strict=True)), 8)
-        self.spread = np.stack(
-            [trail.place_cov[x].mean(axis=0) if len(x) else np.zeros((POSE, POSE)) for x in self._new]
-        )
-        self.middle = np.stack([trail.place[x].mean(axis=0) if len(x) else np.zeros(POSE) for x in self._new])
+    def __init__(self, trail: Trail, closure: Closure) -> None:
+        self.most = max(trail.submaps * closure.candidates, 1)
+        self.count = 0
+        self._odometry = trail.edge, np.linalg.inv(trail.edge_cov)
+        self._pair = np.tile(np.array([[0, 1]], np.int32), (self.most, 1))
+        self._loop, self._information = np.zeros((self.most, POSE)), np.zeros((self.most, POSE, POSE))
 
-    def new(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """Scans that were matched on submap k, and their places in its frame, filled up."""
-        return _filled(self._new[k], self._trail.place[self._new[k]], self._most_new)
+    def add(self, i: int, j: int, found: Registration) -> None:
+        """One more loop."""
+        self._pair[self.count], self._loop[self.count] = (i, j), found.moved
+        self._information[self.count] = np.linalg.inv(np.asarray(found.cov, np.float64))
+        self.count += 1
 
-    def old(self, k: int) -> tuple[np.ndarray, np.ndarray]:
-        """All scans drawn in submap k, and their places in its frame, filled up."""
-        early = self._early[k]
-        places = self._trail.place[self._new[k]]
-        if len(early):
-            edge = np.broadcast_to(self._trail.edge[k - 1], (len(early), POSE))
-            places = np.concatenate([between(edge, self._trail.place[early]), places])
-        return _filled(np.concatenate([early, self._new[k]]), places, self._most_old)
+    def graph(self, loops: int) -> Graph:
+        """With that many loops, filled up with some that say nothing."""
+        if len(self._odometry[0]) == 0:
+            loops = 0  # there is no other pose
+        arrays = (*self._odometry, self._pair[:loops], self._loop[:loops], self._information[:loops])
+        return Graph(*map(jnp.asarray, arrays))
 
 
-def _rounded(size: int, to: int) -> int:
-    """The next multiple: runs that differ a little share what was compiled for one."""
-    return -(-size // to) * to
+def _stacked(found: list[Registration]) -> Registration:
+    shapes = {"moved": (POSE,), "cov": (POSE, POSE)}
+    fields = {name: np.array([getattr(one, name) for one in found]) for name in Registration._fields}
+    return Registration(**{name: x.reshape(len(found), *shapes.get(name, ())) for name, x in fields.items()})  # type: ignore[arg-type]
 
 
-def _filled(index: np.ndarray, places: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    fill = size - len(index)
-    return (
-        np.concatenate([index, np.full(fill, -1)]).astype(np.int32),
-        np.concatenate([places, np.zeros((fill, POSE))]).astype(np.float32),
-    )
+def _nearest(scans: SubmapScans, means: np.ndarray, covs: np.ndarray, j: int, closure: Closure) -> list[int]:
+    """The submaps whose middles may lie within reach of that of submap j."""
+    cos, sin = np.cos(means[:, 2]), np.sin(means[:, 2])
+    x, y, _ = scans.middle[j]
+    away = np.stack([means[:, 0] + cos * x - sin * y, means[:, 1] + sin * x + cos * y], axis=-1)
+    distance = np.hypot(*(away - scans.middle[: len(means), :2]).T)
+    slack = 3 * np.sqrt(np.linalg.eigvalsh(covs[:, :2, :2])[:, -1])
+    order = np.argsort(distance - slack)
+    return [int(i) for i in order[: closure.candidates] if distance[i] - slack[i] < closure.reach]
 
 
 def _window(cov: np.ndarray, closure: Closure) -> tuple[float, float]:
@@ -332,12 +235,22 @@ def _window(cov: np.ndarray, closure: Closure) -> tuple[float, float]:
     return closure.window
 
 
-def _nearest(scans: _Scans, means: np.ndarray, covs: np.ndarray, j: int, closure: Closure) -> list[int]:
-    """The submaps whose middles may lie within reach of that of submap j."""
-    cos, sin = np.cos(means[:, 2]), np.sin(means[:, 2])
-    x, y, _ = scans.middle[j]
-    away = np.stack([means[:, 0] + cos * x - sin * y, means[:, 1] + sin * x + cos * y], axis=-1)
-    distance = np.hypot(*(away - scans.middle[: len(means), :2]).T)
-    slack = 3 * np.sqrt(np.linalg.eigvalsh(covs[:, :2, :2])[:, -1])
-    order = np.argsort(distance - slack)
-    return [int(i) for i in order[: closure.candidates] if distance[i] - slack[i] < closure.reach]
+def scan_poses(trail: Trail, closed: Closed) -> tuple[np.ndarray, np.ndarray]:
+    """Where every scan of a trail was taken, (S, 3), and the covariance of x, y and theta given the first anchor,
+    (S, 3, 3): that of the submap's anchor, and of the scan in it. NaN for scans before the first submap.
+    """
+    anchors = np.asarray(closed.solution.poses, np.float64)
+    cov = np.asarray(marginals(closed.graph, closed.solution), np.float64)
+    k = np.maximum(trail.submap, 0)
+    poses = compose(anchors[k], trail.place)
+    by_anchor, by_place = np.zeros((2, len(k), POSE, POSE))
+    by_anchor[:] = np.eye(POSE)
+    by_anchor[:, 0, 2], by_anchor[:, 1, 2] = anchors[k, 1] - poses[:, 1], poses[:, 0] - anchors[k, 0]
+    cos, sin = np.cos(anchors[k, 2]), np.sin(anchors[k, 2])
+    by_place[:, 0, 0], by_place[:, 0, 1], by_place[:, 1, 0], by_place[:, 1, 1] = cos, -sin, sin, cos
+    by_place[:, 2, 2] = 1
+    of_anchor = np.einsum("sij,sjk,slk->sil", by_anchor, cov[k], by_anchor)
+    total = of_anchor + np.einsum("sij,sjk,slk->sil", by_place, trail.place_cov, by_place)
+    poses[:, 2] = wrapped(poses[:, 2])
+    poses[trail.submap < 0], total[trail.submap < 0] = np.nan, np.nan
+    return poses, total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from jaxlocmap.matching.submaps import MatchReport
@@ -30,47 +31,34 @@ class Trail(NamedTuple):
 def trail_of(report: MatchReport) -> Trail:
     """The trail of a run, from what its matches report, (T,) steps; those without a scan due are left out.
 
-    A submap that was never matched on, because the next ones were begun anew, is none.
+    A submap that nothing was matched on, because the next one was begun anew, is left out too.
     """
-    report = MatchReport(*(np.asarray(x) if not isinstance(x, tuple) else x for x in report))
     due = np.flatnonzero(report.due)
-    number, anew, finished = (np.asarray(x)[due] for x in (report.submap, report.anew, report.finished))
-    place, place_cov = (np.asarray(x, np.float64)[due] for x in report.relative)
-    edge_mean, edge_cov = (np.asarray(x, np.float64)[due] for x in report.edge)
-    drawn = (np.asarray(report.accepted) | np.asarray(report.anew))[due]
-    begins = np.asarray(report.begun)[due]
+
+    def at_due(x: jax.Array) -> np.ndarray:
+        return np.asarray(x)[due]
+
+    anew, begins, finished = (at_due(x) for x in (report.anew, report.begun, report.finished))
+    place, place_cov, edge, edge_cov = (at_due(x).astype(np.float64) for x in (*report.relative, *report.edge))
     submap = np.full(len(due), -1)
-    edges: list[np.ndarray] = []
-    covs: list[np.ndarray] = []
-    begun: list[int] = []
-    current, younger = -1, 0
-    places, place_covs = np.zeros((len(due), POSE)), np.zeros((len(due), POSE, POSE))
+    edges, begun, younger = [], [], 0
     for s in range(len(due)):
-        if anew[s]:
-            if current >= 0:
-                edges.append(place[s])
-                covs.append(place_cov[s])
-            current += 1
+        if anew[s]:  # at the pose of this scan, as far as the submap before is concerned
+            edges.append((place[s], place_cov[s]))
             begun.append(s)
-            submap[s] = current
-            continue
-        if current < 0:
-            continue
-        submap[s], places[s], place_covs[s] = current, place[s], place_cov[s]
+        submap[s] = len(begun) - 1
         if finished[s]:
-            edges.append(edge_mean[s])
-            covs.append(edge_cov[s])
-            current += 1
+            edges.append((edge[s], edge_cov[s]))
             begun.append(younger)
         if begins[s]:
             younger = s
-    del number
+    own = anew | (submap < 0)  # the anchor itself
     return Trail(
-        np.array(edges).reshape(-1, POSE),
-        np.array(covs).reshape(-1, POSE, POSE),
-        submap,
-        places,
-        place_covs,
-        drawn & (submap >= 0),
-        np.array(begun, int),
+        edge=np.array([mean for mean, _ in edges[1:]]).reshape(-1, POSE),
+        edge_cov=np.array([cov for _, cov in edges[1:]]).reshape(-1, POSE, POSE),
+        submap=submap,
+        place=np.where(own[:, None], 0, place),
+        place_cov=np.where(own[:, None, None], 0, place_cov),
+        drawn=(at_due(report.accepted) | anew) & (submap >= 0),
+        begun=np.array(begun, int),
     )
