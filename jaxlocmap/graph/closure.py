@@ -50,6 +50,7 @@ class Closure:
     least_share: float = 0.7  # in (0, 1): of the points on lines of the older submap
     most_std: float = 0.03  # m, > 0: of the place matched, in its worst direction
     gate_probability: float = 0.999  # in (0, 1): share of good loops let in
+    scale: float = 1.0  # > 0: standard deviations of loops are this times what matches and filter say
     points: int = 1200  # of a submap that are matched at most, about; >= 10
 
     def __post_init__(self) -> None:
@@ -62,10 +63,10 @@ class Closure:
             checks.number(name, getattr(self, name))
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"Closure.{name}: expected a value inside (0, 1), got {getattr(self, name)}")
-        for name in ("reach", "most_std"):
+        for name in ("reach", "most_std", "scale"):
             checks.number(name, getattr(self, name))
             if not 0 < getattr(self, name) < math.inf:
-                raise ValueError(f"Closure.{name}: expected finite metres > 0, got {getattr(self, name)}")
+                raise ValueError(f"Closure.{name}: expected a finite number > 0, got {getattr(self, name)}")
         if len(self.window) != 2 or not all(0 < x < math.inf for x in self.window):
             raise ValueError(f"Closure.window: expected two finite numbers > 0, m and rad, got {self.window}")
 
@@ -155,7 +156,7 @@ def close_loops(
             ]
             means = between(poses[old], poses[j])
             for i in _nearest(scans, means, apart, j, closure):
-                spread = scans.spread[i] + scans.spread[j]
+                spread = closure.scale**2 * (scans.spread[i] + scans.spread[j])
                 result = register(
                     points,
                     scans.map(i),

@@ -1,6 +1,6 @@
 """Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. Nowhere else: matplotlib."""
 
-from jaxlocmap.plotting.graphs import graph_figure
+from jaxlocmap.plotting.graphs import graph_figure, slam_figure
 from jaxlocmap.plotting.maps import map_figure, trajectory_figure
 from jaxlocmap.plotting.studies import (
     judge_figure,
@@ -25,6 +25,7 @@ __all__ = [
     "map_figure",
     "matching_figure",
     "precision_figure",
+    "slam_figure",
     "study_before_after_figure",
     "study_figure",
     "sweep_figure",

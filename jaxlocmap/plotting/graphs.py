@@ -10,10 +10,36 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from jaxlocmap.consistency import chi2_quantile
 from jaxlocmap.plotting.maps import ellipses_of_position
-from jaxlocmap.plotting.style import ESTIMATE, EXPECTED, save
+from jaxlocmap.plotting.style import BAND, ESTIMATE, EXPECTED, from_zero, save
+from jaxlocmap.se2 import POSE
 
 _WEIGHTS = "coolwarm_r"  # 0 red, 1 blue
+
+
+def slam_figure(path: Path, before: np.ndarray, after: np.ndarray, seconds: float, title: str) -> None:
+    """Errors, standard deviations and NEES over time, without and with closed loops.
+
+    Args:
+        before, after: (N, S, 4) of N runs: squared error of position m² and of heading rad², NEES, variance of position
+            m².
+        seconds: between two scans.
+    """
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    time = seconds * np.arange(before.shape[1])
+    for values, color, name in ((before, "0.4", "loops open"), (after, ESTIMATE, "loops closed")):
+        upper.plot(time, np.sqrt(values[..., 0].mean(axis=0)), color=color, label=f"{name}: RMSE")
+        upper.plot(time, np.sqrt(values[..., 3].mean(axis=0)), color=color, ls="--", label=f"{name}: 1 sigma")
+        lower.plot(time[1:], np.nanmean(values[:, 1:, 2], axis=0), color=color, label=name)
+    lower.axhspan(*(chi2_quantile(p, POSE * len(before)) / len(before) for p in (0.025, 0.975)), color=BAND, alpha=0.3)
+    lower.axhline(POSE, color=EXPECTED, lw=1, label="3, with the 95 % band of a consistent one")
+    upper.set(ylabel="position [m]", title=f"{title}: mean over {len(before)} runs")
+    lower.set(xlabel="time [s]", ylabel="NEES of the pose [–]")
+    from_zero(upper)
+    from_zero(lower)
+    save(figure, path, dpi=120)
 
 
 def graph_figure(
