@@ -121,11 +121,9 @@ def write_loops(out: Path, loops: Loops, log: Log, report: dict[str, Any]) -> li
         begin = np.asarray(graph.dead_reckoning(found.graph, jnp.asarray(anchors[0])))
     trail = loops.trail
     before = compose(begin[np.maximum(trail.submap, 0)], trail.place)
-    every = [np.flatnonzero(trail.submap == k) for k in range(trail.submaps)]
-    middle = np.array([scans[len(scans) // 2] for scans in every])
     title = f"{log.name}: {trail.submaps} submaps, {len(accepted)} loops, drawn between the submaps' middles"
     plotting.graph_figure(
-        out / "graph.png", loops.poses, loops.cov, middle[accepted], weights, before=before, title=title
+        out / "graph.png", loops.poses, loops.cov, trail.middle[accepted], weights, before=before, title=title
     )
     return ["graph.g2o", "poses.csv", "graph.png"]
 

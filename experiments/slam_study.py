@@ -74,9 +74,7 @@ class SlamStudyConfig:
 class Scores:
     """What the runs say, a list with one entry a run."""
 
-    before: list[np.ndarray] = dataclasses.field(
-        default_factory=list
-    )  # (S, 4) of `_scored`
+    before: list[np.ndarray] = dataclasses.field(default_factory=list)  # (S, 4) of `_scored`
     after: list[np.ndarray] = dataclasses.field(default_factory=list)
     edges: list[np.ndarray] = dataclasses.field(default_factory=list)  # NEES of the filter's edges between submaps
     loops: list[np.ndarray] = dataclasses.field(default_factory=list)  # NEES of the loops accepted
@@ -195,9 +193,7 @@ class _Study:
         anchors, accepted = truth[trail.begun], attempts.accepted
         scores.loops.append(_nees(between(anchors[i], anchors[j]) - moved, cov)[accepted])
         # Judged where they were matched, at the submaps' middles: an anchor lies metres from there.
-        every = [np.flatnonzero(trail.submap == k) for k in range(trail.submaps)]
-        middle = np.array([scans[len(scans) // 2] for scans in every])
-        a, b = middle[i], middle[j]
+        a, b = trail.middle[i], trail.middle[j]
         off = between(truth[a], truth[b]) - between(trail.place[a], compose(moved, trail.place[b]))
         false = (np.hypot(off[:, 0], off[:, 1]) > _FALSE[0]) | (np.abs(wrapped(off[:, 2])) > _FALSE[1])
         kept = np.zeros_like(accepted)

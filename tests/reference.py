@@ -516,3 +516,54 @@ def course_run(seed=4, motion="capstone", conventions="course", gate=COURSE_GATE
         "occupancy_max": float(occupancy.max()),
         "occupancy_mean": float(occupancy.mean()),
     }
+
+
+# --- Pose graphs (g2o, Kümmerle et al. 2011): edges (a, b, z (3,), Omega (3, 3)); poses (N, 3), the first fixed ---
+
+
+def graph_error(a, b, z):
+    """(Z⁻¹ A⁻¹ B) as (x, y, theta): multiply homogeneous matrices, read the result."""
+
+    def matrix(p):
+        c, s = math.cos(p[2]), math.sin(p[2])
+        return np.array([[c, -s, p[0]], [s, c, p[1]], [0.0, 0.0, 1.0]])
+
+    E = np.linalg.inv(matrix(z)) @ np.linalg.inv(matrix(a)) @ matrix(b)
+    return np.array([E[0, 2], E[1, 2], math.atan2(E[1, 0], E[0, 0])])
+
+
+def graph_linear(poses, edges, weights=None, step=1e-6):
+    """chi-square, half its slope and J^T Omega J by (x, y, theta) of all poses but the first; J by differences."""
+    n = len(poses)
+    chi2, g, H = 0.0, np.zeros(3 * n), np.zeros((3 * n, 3 * n))
+    for k, (a, b, z, Omega) in enumerate(edges):
+        w = 1.0 if weights is None else weights[k]
+        e = graph_error(poses[a], poses[b], z)
+        J = np.zeros((3, 3 * n))
+        for which in (a, b):
+            for i in range(3):
+                up, down = poses.copy(), poses.copy()
+                up[which, i] += step
+                down[which, i] -= step
+                difference = graph_error(up[a], up[b], z) - graph_error(down[a], down[b], z)
+                difference[2] = wrap(difference[2])
+                J[:, 3 * which + i] = difference / (2 * step)
+        chi2 += w * e @ Omega @ e
+        g += w * J.T @ Omega @ e
+        H += w * J.T @ Omega @ J
+    return chi2, g[3:], H[3:, 3:]
+
+
+def graph_optimum(poses, edges, steps=30):
+    """Gauss-Newton; the optimum, chi-square there and the covariance of (x, y, theta) of all poses, that of the first
+    zero.
+    """
+    poses = poses.copy()
+    for _ in range(steps):
+        _, g, H = graph_linear(poses, edges)
+        poses[1:] -= np.linalg.solve(H, g).reshape(-1, 3)
+    poses[:, 2] = wrap(poses[:, 2])
+    chi2, _, H = graph_linear(poses, edges)
+    cov = np.zeros((3 * len(poses), 3 * len(poses)))
+    cov[3:, 3:] = np.linalg.inv(H)
+    return poses, chi2, cov

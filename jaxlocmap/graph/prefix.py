@@ -30,4 +30,4 @@ def prefix_sum(x: jax.Array) -> jax.Array:
 def suffix_sum(x: jax.Array) -> jax.Array:
     """Sums of the entries from each on, along the first axis, (K, ...)."""
     total = prefix_sum(x)
-    return total[-1] - total[:-1]
+    return total[-1:] - total[:-1]

@@ -114,8 +114,8 @@ def factorised(system: System, *, sparsax: bool) -> Sparse:
     row, column, value = [], [], []
     for entries, places, a, b in blocks:
         i, j = np.array(places, np.int32).T
-        row.append((a[:, None] * d + i).reshape(-1))
-        column.append((b[:, None] * d + j).reshape(-1))
+        row.append((a[:, None] * d + i[None]).reshape(-1))
+        column.append((b[:, None] * d + j[None]).reshape(-1))
         value.append(entries.reshape(-1))
     rows, columns, values = (jnp.concatenate(part) for part in (row, column, value))
     rows, columns = jnp.minimum(rows, columns), jnp.maximum(rows, columns)

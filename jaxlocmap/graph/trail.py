@@ -27,6 +27,14 @@ class Trail(NamedTuple):
         """How many there are."""
         return len(self.begun)
 
+    @property
+    def middle(self) -> np.ndarray:
+        """(N,) int: the scan in the middle of each submap's own; the one at which it began, if it has none."""
+        own = [np.flatnonzero(self.submap == k) for k in range(self.submaps)]
+        return np.array(
+            [scans[len(scans) // 2] if len(scans) else at for scans, at in zip(own, self.begun, strict=True)]
+        )
+
 
 def trail_of(report: MatchReport) -> Trail:
     """The trail of a run, from what its matches report, (T,) steps; those without a scan due are left out.

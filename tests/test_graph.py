@@ -1,0 +1,470 @@
+"""Pose graphs: against a dense reference with numerical Jacobians, in limiting cases, in batches, and their faults."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import reference
+from jax.test_util import check_grads
+
+from jaxlocmap import graph as pose_graph
+from jaxlocmap.graph import Graph, Kernel, sparse
+from jaxlocmap.graph.prefix import prefix_sum, suffix_sum
+from jaxlocmap.poses import between, compose
+
+pytestmark = pytest.mark.usefixtures("x64")
+N, L = 8, 4
+STD = np.array([0.1, 0.08, 0.05])
+METHODS = [
+    "loop_space",
+    "scipy",
+    pytest.param("sparsax", marks=pytest.mark.skipif(not sparse.has_sparsax(), reason="no sparsax")),
+]
+
+
+def information(rng, std=STD):
+    """A full matrix whose standard deviations are about `std`."""
+    A = np.eye(3) + 0.3 * rng.normal(size=(3, 3))
+    return (A @ A.T) / np.outer(std, std)
+
+
+def drawn(seed, poses=N, loops=L, false=0):
+    """The true poses, and a graph of measurements with the noise that their information says; the last loops false."""
+    rng = np.random.default_rng(seed)
+    steps = np.column_stack([np.ones(poses - 1), 0.2 * rng.normal(size=poses - 1), 0.5 * rng.normal(size=poses - 1)])
+    truth = np.zeros((poses, 3))
+    for k in range(poses - 1):
+        truth[k + 1] = compose(truth[k], steps[k])
+    pair = np.array([rng.choice(poses, 2, replace=False) for _ in range(loops)]).reshape(-1, 2)
+
+    def measured(exact):
+        omega = np.array([information(rng) for _ in exact]).reshape(-1, 3, 3)
+        noise = [np.linalg.solve(np.linalg.cholesky(omega_k).T, rng.normal(size=3)) for omega_k in omega]
+        # The error e = Z⁻¹ (A⁻¹ B) is the noise.
+        z = [compose(x, between(np.asarray(e), np.zeros(3))) for x, e in zip(exact, noise, strict=True)]
+        return np.array(z).reshape(-1, 3), omega
+
+    odometry, odometry_information = measured(between(truth[:-1], truth[1:]))
+    loop, loop_information = measured(between(truth[pair[:, 0]], truth[pair[:, 1]]))
+    if false:
+        loop[-false:] = rng.uniform(-1, 1, (false, 3)) * [poses / 3, poses / 3, 3]
+    arrays = odometry, odometry_information, pair.astype(np.int32), loop, loop_information
+    return truth, Graph(*map(jnp.asarray, arrays))
+
+
+def edges_of(graph):
+    chain = [(k, k + 1, z, O) for k, (z, O) in enumerate(zip(*map(np.asarray, graph[:2]), strict=True))]
+    pair, loop, omega = map(np.asarray, graph[2:])
+    return chain + [(int(a), int(b), z, O) for (a, b), z, O in zip(pair, loop, omega, strict=True)]
+
+
+@functools.cache
+def optimum(seed=0):
+    _, graph = drawn(seed)
+    return reference.graph_optimum(np.asarray(pose_graph.dead_reckoning(graph)), edges_of(graph))
+
+
+def blocks(cov):
+    return np.array([cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(cov) // 3)])
+
+
+@pytest.mark.parametrize("count", [0, 1, 31, 32, 33, 100])
+def test_prefix_sums(count):
+    x = np.random.default_rng(0).normal(size=(count, 2))
+    expected = np.concatenate([np.zeros((1, 2)), np.cumsum(x, axis=0)])
+    np.testing.assert_allclose(prefix_sum(jnp.asarray(x)), expected, atol=1e-12)
+    np.testing.assert_allclose(suffix_sum(jnp.asarray(x)), expected[-1] - expected[:-1], atol=1e-12)
+
+
+def test_errors_and_squares():
+    truth, graph = drawn(3)
+    chain, loops = pose_graph.errors(graph, jnp.asarray(truth))
+    squares = np.concatenate(pose_graph.chi2(graph, jnp.asarray(truth)))
+    for k, (a, b, z, omega) in enumerate(edges_of(graph)):
+        e = reference.graph_error(truth[a], truth[b], z)
+        np.testing.assert_allclose(np.concatenate([chain, loops])[k], e, atol=1e-12)
+        np.testing.assert_allclose(squares[k], e @ omega @ e, rtol=1e-10)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("start", [None, "odometry"])
+def test_optimum(method, start):
+    _, graph = drawn(0)
+    begin = None if start is None else pose_graph.dead_reckoning(graph)
+    solution = pose_graph.solve(graph, begin, method=method)
+    poses, chi2, _ = optimum()
+    assert solution.converged and solution.finite
+    np.testing.assert_allclose(solution.poses, poses, atol=1e-6)
+    np.testing.assert_allclose(solution.chi2, chi2, rtol=1e-7)
+    np.testing.assert_allclose(solution.objective, chi2, rtol=1e-7)
+    np.testing.assert_array_equal(solution.weights, np.ones(L))
+    if start:
+        squares = pose_graph.chi2(graph, begin)
+        np.testing.assert_allclose(solution.chi2_start, np.sum(squares[0]) + np.sum(squares[1]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_covariances(method):
+    _, graph = drawn(0)
+    solution = pose_graph.solve(graph, method=method)
+    poses, _, cov = optimum()
+    expected = blocks(cov)
+    marginals = functools.partial(pose_graph.marginals, graph, solution, method=method)
+    np.testing.assert_allclose(marginals(), expected, rtol=1e-4, atol=1e-7)
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    for frame, T in (
+        ("body", [[c, s, 0 * c], [-s, c, 0 * c], [0 * c, 0 * c, 0 * c + 1]]),
+        # xi = (v, omega): t moves by v + omega J t, so v = dt - dtheta J t.
+        ("world", [[0 * c + 1, 0 * c, poses[:, 1]], [0 * c, 0 * c + 1, -poses[:, 0]], [0 * c, 0 * c, 0 * c + 1]]),
+    ):
+        T = np.moveaxis(np.array(T), -1, 0)
+        wanted = np.einsum("kij,kjl,kml->kim", T, expected, T)
+        np.testing.assert_allclose(marginals(frame=frame), wanted, rtol=1e-4, atol=1e-7)
+    # Of one pose seen from another, by differences of `between` on the joint covariance.
+    pair = np.array([[2, 6], [5, 1], [0, 7]], np.int32)
+    found = pose_graph.relative_covariances(graph, solution, jnp.asarray(pair), method=method)
+    for (a, b), got in zip(pair, found, strict=True):
+        J = np.zeros((3, 3 * N))
+        for which in (a, b):
+            for i in range(3):
+                up, down = poses.copy(), poses.copy()
+                up[which, i] += 1e-6
+                down[which, i] -= 1e-6
+                J[:, 3 * which + i] = (between(up[a], up[b]) - between(down[a], down[b])) / 2e-6
+        np.testing.assert_allclose(got, J @ cov @ J.T, rtol=1e-4, atol=1e-7)
+        if a == 0:
+            np.testing.assert_allclose(got, expected[b], rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_another_pose_given(method):
+    _, graph = drawn(0)
+    solution = pose_graph.solve(graph, method=method)
+    given = pose_graph.marginals(graph, solution, fixed=3, frame="world", method=method)
+    pair = jnp.stack([jnp.full(N, 3, jnp.int32), jnp.arange(N, dtype=jnp.int32)], axis=-1)
+    np.testing.assert_allclose(
+        given, pose_graph.relative_covariances(graph, solution, pair, frame="world", method=method), atol=1e-12
+    )
+    np.testing.assert_allclose(given[3], 0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"fixed: expected a pose of 0 to 7, got 8"):
+        pose_graph.marginals(graph, solution, fixed=8)
+
+
+def exact(seed):
+    """A graph without noise."""
+    truth, graph = drawn(seed)
+    a, b = np.asarray(graph.pair).T
+    return truth, graph._replace(
+        odometry=jnp.asarray(between(truth[:-1], truth[1:])), loop=jnp.asarray(between(truth[a], truth[b]))
+    )
+
+
+def test_chordal_start_is_exact_without_noise():
+    truth, graph = exact(5)
+    first = np.array([3.0, -2.0, 1.0])
+    expected = compose(np.broadcast_to(first, truth.shape), truth)
+    found = pose_graph.chordal(graph, jnp.asarray(first))
+    np.testing.assert_allclose(found[:, :2], expected[:, :2], atol=1e-9)
+    np.testing.assert_allclose(reference.wrap(found[:, 2] - expected[:, 2]), 0, atol=1e-9)
+
+
+def test_noise_free_has_no_error():
+    truth, graph = exact(5)
+    solution = pose_graph.solve(graph)
+    assert solution.converged
+    np.testing.assert_allclose(solution.poses[:, :2], truth[:, :2], atol=1e-9)
+    assert solution.chi2 < 1e-15
+
+
+def test_without_loops_odometry_comes_back():
+    _, graph = drawn(0)
+    graph = Graph(
+        graph.odometry, graph.odometry_information, graph.pair[:0], graph.loop[:0], graph.loop_information[:0]
+    )
+    solution = pose_graph.solve(graph)
+    assert solution.converged
+    np.testing.assert_allclose(solution.poses, pose_graph.dead_reckoning(graph), atol=1e-12)
+    _, _, cov = reference.graph_optimum(np.asarray(solution.poses), edges_of(graph), steps=1)
+    np.testing.assert_allclose(pose_graph.marginals(graph, solution), blocks(cov), rtol=1e-4, atol=1e-7)
+
+
+def test_two_equal_edges_count_twice():
+    _, graph = drawn(0)
+    twice = graph._replace(
+        pair=graph.pair.at[1].set(graph.pair[0]),
+        loop=graph.loop.at[1].set(graph.loop[0]),
+        loop_information=graph.loop_information.at[1].set(graph.loop_information[0]),
+    )
+    once = graph._replace(loop_information=graph.loop_information.at[0].multiply(2.0).at[1].set(0))
+    np.testing.assert_allclose(pose_graph.solve(twice).poses, pose_graph.solve(once).poses, atol=1e-8)
+
+
+# --- Kernels ---
+
+NAMES = ["quadratic", "huber", "cauchy", "geman_mcclure", "dcs", "gnc"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_weight_is_the_derivative_of_rho(name):
+    kernel = Kernel(name)
+    square = jnp.array([0.01, 0.5, 0.9, 1.2, 5.0, 11.0, 12.0, 400.0])
+    slope = jax.vmap(jax.grad(kernel.rho))(square)
+    np.testing.assert_allclose(kernel.weight(square), slope, atol=1e-12)
+    assert np.all(np.diff(kernel.weight(square)) <= 1e-12)
+    np.testing.assert_allclose(kernel.rho(jnp.array([1e-6])), [1e-6], rtol=1e-5)
+
+
+def test_kernels_at_their_scale():
+    assert float(Kernel("cauchy", 2.0).weight(jnp.array(4.0))) == pytest.approx(1 / 2)
+    assert float(Kernel("geman_mcclure", 2.0).weight(jnp.array(4.0))) == pytest.approx(1 / 4)
+    assert float(Kernel("huber", 2.0).weight(jnp.array(16.0))) == pytest.approx(1 / 2)
+    assert float(Kernel("dcs", 2.0).weight(jnp.array(6.0))) == pytest.approx(1 / 4)
+    assert float(Kernel("gnc", 2.0).weight(jnp.array(4.1))) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(("tukey",), "kernel: expected one of"), (("huber", 0.0), "scale: expected a number > 0, got 0.0")],
+)
+def test_kernels_refused(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        Kernel(*arguments)
+
+
+@pytest.mark.parametrize("name", ["cauchy", "geman_mcclure", "dcs", "huber"])
+def test_robust_optimum_has_no_slope(name):
+    _, graph = drawn(1, false=1)
+    solution = pose_graph.solve(graph, kernel=name)
+    assert solution.converged
+    weights = np.concatenate([np.ones(N - 1), solution.weights])
+    _, g, H = reference.graph_linear(np.asarray(solution.poses), edges_of(graph), weights)
+    assert g @ np.linalg.solve(H, g) < 1e-6
+    squares = pose_graph.chi2(graph, solution.poses)
+    np.testing.assert_allclose(solution.weights, Kernel(name).weight(squares[1]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("false", [3, 6])
+def test_false_loops_are_found(false):
+    clean = drawn(2, poses=40, loops=12)[1]
+    _, wrong = drawn(7, poses=40, loops=6, false=6)
+    joined = clean._replace(
+        **{name: jnp.concatenate([getattr(clean, name), getattr(wrong, name)[:false]]) for name in Graph._fields[2:]}
+    )
+    solution = pose_graph.solve(joined, kernel="gnc")
+    assert solution.converged
+    np.testing.assert_array_equal(solution.weights, [1.0] * 12 + [0.0] * false)
+    np.testing.assert_allclose(solution.poses, pose_graph.solve(clean).poses, atol=1e-6)
+
+
+# --- Batches ---
+
+
+def batch(count=5):
+    return pose_graph.stack([drawn(seed, loops=L - seed % 2)[1] for seed in range(count)])
+
+
+@functools.cache
+def solved_in_batch():
+    return jax.jit(jax.vmap(functools.partial(pose_graph.solve)))
+
+
+def test_batch_is_a_loop():
+    graphs = batch()
+    together = solved_in_batch()(graphs)
+    for k in range(5):
+        alone = pose_graph.solve(jax.tree.map(lambda x, k=k: x[k], graphs))
+        np.testing.assert_allclose(together.poses[k], alone.poses, atol=1e-8)
+        assert together.iterations[k] == alone.iterations
+
+
+def test_filling_up_changes_nothing():
+    small = drawn(1, poses=6, loops=2)[1]
+    stacked = pose_graph.stack([small, drawn(0)[1]])
+    alone = pose_graph.solve(small)
+    filled = pose_graph.solve(jax.tree.map(lambda x: x[0], stacked))
+    np.testing.assert_allclose(filled.poses[:6], alone.poses, atol=1e-8)
+    np.testing.assert_allclose(filled.chi2, alone.chi2, rtol=1e-8)
+
+
+@pytest.mark.parametrize("field", Graph._fields[:2] + Graph._fields[3:])
+def test_one_graph_that_is_no_number_spoils_no_other(field):
+    graphs = batch()
+    bad = graphs._replace(**{field: getattr(graphs, field).at[2, 0].set(jnp.nan)})
+    good, spoiled = solved_in_batch()(graphs), solved_in_batch()(bad)
+    others = np.array([0, 1, 3, 4])
+    for name, a, b in zip(good._fields, good, spoiled, strict=True):
+        np.testing.assert_array_equal(np.asarray(a)[others], np.asarray(b)[others], err_msg=name)
+    np.testing.assert_array_equal(spoiled.converged, [True, True, False, True, True])
+    np.testing.assert_array_equal(spoiled.finite, [True, True, False, True, True])
+
+
+def test_values_do_not_compile_again():
+    with jax.log_compiles(False):
+        solve = solved_in_batch()
+        solve(batch())
+        before = solve._cache_size()
+        solve(batch()._replace(odometry=batch().odometry * 1.01))
+        assert solve._cache_size() == before
+
+
+def test_float32():
+    _, graph = drawn(0)
+    single = graph._replace(**{n: x.astype(jnp.float32) for n, x in graph._asdict().items() if n != "pair"})
+    solution = pose_graph.solve(single)
+    assert solution.converged
+    assert solution.poses.dtype == jnp.float32
+    np.testing.assert_allclose(solution.poses, optimum()[0], atol=2e-4)
+    np.testing.assert_allclose(pose_graph.marginals(single, solution), blocks(optimum()[2]), rtol=2e-2, atol=1e-5)
+
+
+# --- Derivatives ---
+
+
+@pytest.mark.parametrize("method", ["loop_space", "scipy"])
+def test_gradient(method):
+    _, graph = drawn(0)
+    target = jnp.asarray(np.random.default_rng(3).normal(size=(N, 3)))
+
+    def loss(odometry, loop, log_scale):
+        moved = graph._replace(
+            odometry=odometry, loop=loop, loop_information=graph.loop_information * jnp.exp(log_scale)
+        )
+        return jnp.sum(pose_graph.solve(moved, kernel=Kernel("cauchy", 3.0), method=method).poses * target)
+
+    check_grads(
+        loss, (graph.odometry, graph.loop, jnp.zeros(())), order=1, modes=["rev"], eps=1e-4, atol=1e-5, rtol=1e-5
+    )
+
+
+def test_gradient_by_the_scale_of_a_kernel():
+    _, graph = drawn(1, false=1)
+
+    def last(scale):
+        return pose_graph.solve(graph, kernel=Kernel("geman_mcclure", scale)).poses[-1, 0]
+
+    check_grads(last, (jnp.array(3.0),), order=1, modes=["rev"], eps=1e-4, atol=1e-5, rtol=1e-5)
+
+
+# --- Statistics ---
+
+
+def test_covariance_of_the_last_pose_holds():
+    """300 graphs of 20 poses. The mean NEES of consistent ones is 3, its standard error √(6 / 300) = 0.14; four of
+    these, and 0.1 for the bend of the errors, which is not in a covariance.
+    """
+    drawn_ones = [drawn(100 + seed, poses=20) for seed in range(300)]
+    graphs = pose_graph.stack([graph for _, graph in drawn_ones])
+
+    def score(graph, truth):
+        solution = pose_graph.solve(graph)
+        cov = pose_graph.marginals(graph, solution, frame="body")[-1]
+        error = jnp.asarray(between(np.zeros(3), np.zeros(3)))
+        last, true = solution.poses[-1], truth[-1]
+        c, s = jnp.cos(last[2]), jnp.sin(last[2])
+        d = true - last
+        error = jnp.stack([c * d[0] + s * d[1], c * d[1] - s * d[0], jnp.arctan2(jnp.sin(d[2]), jnp.cos(d[2]))])
+        return error @ jnp.linalg.solve(cov, error), solution.converged
+
+    nees, converged = jax.jit(jax.vmap(score))(graphs, jnp.asarray(np.array([truth for truth, _ in drawn_ones])))
+    assert converged.all()
+    assert abs(float(nees.mean()) - 3) < 4 * np.sqrt(6 / 300) + 0.1
+
+
+# --- Faults ---
+
+
+def test_parts_that_nothing_ties():
+    _, graph = drawn(0)
+    graph = graph._replace(
+        odometry_information=graph.odometry_information.at[3].set(0),
+        pair=jnp.tile(jnp.array([[0, 2]], jnp.int32), (L, 1)),
+    )
+    solution = pose_graph.solve(graph)
+    assert not solution.converged
+    (said,) = pose_graph.faults(graph, solution)
+    assert "the graph has 2 parts: nothing ties 4 poses, such as 4, to the first" in said
+
+
+def test_a_missing_link_that_a_loop_bridges():
+    truth, graph = exact(5)
+    pair = jnp.array([[2, 5], [0, 4], [1, 7], [6, 3]], jnp.int32)
+    a, b = np.asarray(pair).T
+    graph = graph._replace(
+        odometry_information=graph.odometry_information.at[3].set(0),
+        odometry=graph.odometry.at[3].set(9.0),
+        pair=pair,
+        loop=jnp.asarray(between(truth[a], truth[b])),
+    )
+    solution = pose_graph.solve(graph)
+    assert solution.converged
+    np.testing.assert_allclose(solution.poses[:, :2], truth[:, :2], atol=1e-7)
+    refused = pose_graph.solve(graph, method="loop_space")
+    assert not refused.converged
+    np.testing.assert_array_equal(np.flatnonzero(~np.asarray(refused.good_odometry)), [3])
+    assert "odometry: the information of 1 is not positive definite, the first number 3" in pose_graph.faults(
+        graph, refused
+    )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_indefinite_information(method):
+    _, graph = drawn(0)
+    bad = jnp.diag(jnp.array([1.0, -1.0, 1.0]))
+    for field, at in (("odometry_information", 2), ("loop_information", 1)):
+        wrong = graph._replace(**{field: getattr(graph, field).at[at].set(bad)})
+        if method == "sparsax" and field == "odometry_information":
+            continue  # CHOLMOD refuses a matrix that is not positive definite for the whole call
+        solution = pose_graph.solve(wrong, method=method)
+        assert not solution.converged
+        assert any(f"the first number {at}" in said for said in pose_graph.faults(wrong, solution))
+
+
+def test_too_few_steps():
+    _, graph = drawn(0)
+    solution = pose_graph.solve(graph, pose_graph.dead_reckoning(graph), steps=1)
+    assert not solution.converged
+    assert pose_graph.faults(graph, solution) == ["not settled after 1 steps: the poses are the best on the way"]
+    np.testing.assert_allclose(solution.poses, pose_graph.dead_reckoning(graph), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (
+            {"pair": jnp.array([[0, 9]] * L, jnp.int32)},
+            ValueError,
+            r"pair: expected two different poses of 0 to 7, got \[0, 9\]",
+        ),
+        ({"pair": jnp.array([[3, 3]] * L, jnp.int32)}, ValueError, "pair: expected two different poses"),
+        ({"pair": jnp.zeros((L, 2))}, TypeError, "pair: expected dtype integer"),
+        ({"loop": jnp.zeros((L + 1, 3))}, ValueError, "loop: expected shape"),
+        ({"odometry_information": jnp.zeros((N - 1, 3))}, ValueError, "odometry_information: expected shape"),
+    ],
+)
+def test_graphs_refused(change, error, words):
+    _, graph = drawn(0)
+    with pytest.raises(error, match=words):
+        pose_graph.solve(graph._replace(**change))
+
+
+def test_arguments_refused():
+    _, graph = drawn(0)
+    solution = pose_graph.solve(graph)
+    for call, words in (
+        (lambda: pose_graph.solve(graph, method="magic"), "method: expected one of"),
+        (lambda: pose_graph.solve(graph, kernel="magic"), "kernel: expected one of"),
+        (lambda: pose_graph.solve(graph, steps=0), "steps: expected at least 1, got 0"),
+        (lambda: pose_graph.solve(graph, jnp.zeros((3, 3))), "start: expected shape"),
+        (lambda: pose_graph.marginals(graph, solution, frame="map"), "frame: expected one of"),
+        (lambda: pose_graph.stack([]), "graphs: expected at least one, got none"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            call()
+
+
+def test_kernel_is_a_pytree():
+    kernel = jax.tree.map(lambda x: 2 * x, Kernel("huber", 1.5))
+    assert dataclasses.astuple(kernel) == ("huber", 3.0)
