@@ -8,10 +8,11 @@ import jaxlocmap
 ROOT = Path(jaxlocmap.__file__).parent
 LAYERS = (
     ("_internal", "checks", "files"),
-    ("se2",),
+    ("se2", "poses"),
     ("parameters", "types", "motion", "sensors"),
     ("filters", "mapping"),
     ("matching",),
+    ("graph",),
     ("step",),
     ("pipeline",),
     ("simulation",),

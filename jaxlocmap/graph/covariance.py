@@ -86,7 +86,7 @@ def _check_frame(frame: str) -> None:
 @functools.partial(jax.jit, static_argnames=("frame", "fixed", "method"))
 def _marginals(graph: Graph, poses: jax.Array, weights: jax.Array, frame: str, fixed: int, method: str) -> jax.Array:
     system = _factorised(graph, poses, weights, method)
-    every = jnp.arange(len(poses))
+    every = jnp.arange(len(poses), dtype=jnp.int32)
     cov = system.covariances(jnp.stack([0 * every + fixed, every], axis=-1)) if fixed else system.marginals()
     heading = poses[:, 2] if frame == "body" else jnp.zeros_like(poses[:, 2])
     return cov if frame == "world" else _carried(cov, poses, heading)

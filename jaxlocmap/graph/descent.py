@@ -45,7 +45,7 @@ class Found(NamedTuple):
 def descend(graph: Graph, start: jax.Array, kernel: Kernel, weights: jax.Array, method: str, steps: int) -> Found:
     """The least objective from a start (N, 3), loops weighed by `weights` (L,) and the kernel."""
     edges, dtype = prepared(graph), start.dtype
-    tolerance = float(jnp.finfo(dtype).eps) ** 0.5
+    tolerance = float(jnp.finfo(dtype).eps) ** (2 / 3)
 
     def turn(now: _Search) -> _Search:
         step = gauss_newton(edges, graph.pair, now.poses, kernel, weights, method)

@@ -62,7 +62,7 @@ class LoopSpace(NamedTuple):
 
     def marginals(self) -> jax.Array:
         """Covariances of all vectors, (N, d, d)."""
-        every = jnp.arange(len(self.sums))
+        every = jnp.arange(len(self.sums), dtype=jnp.int32)
         return self.covariances(jnp.stack([0 * every, every], axis=-1))
 
     def covariances(self, pair: jax.Array) -> jax.Array:

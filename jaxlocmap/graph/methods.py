@@ -20,7 +20,9 @@ def resolve(method: str | None, graph: Graph) -> str:
         ValueError: an unknown name. ImportError: `sparsax` asked for where it cannot be used.
     """
     if method is None:
-        if graph.loops <= MOST_LOOPS and not _broken(graph):
+        if _broken(graph):
+            return "scipy"  # which flags what CHOLMOD refuses for the whole call
+        if graph.loops <= MOST_LOOPS:
             return "loop_space"
         return "sparsax" if sparse.has_sparsax() else "scipy"
     checks.named("method", method, dict.fromkeys(METHODS), "None")

@@ -59,7 +59,7 @@ class Sparse(NamedTuple):
     def marginals(self) -> jax.Array:
         """Covariances of all vectors, (N, d, d)."""
         if not self.sparsax:
-            every = jnp.arange(self.vectors)
+            every = jnp.arange(self.vectors, dtype=jnp.int32)
             return self.covariances(jnp.stack([0 * every, every], axis=-1))
         import sparsax
 
