@@ -77,8 +77,9 @@ def main(config: GraphConfig) -> dict[str, Any]:
     CONSOLE.print(f"{file.graph.poses} poses, {file.graph.loops} loops; compiling takes some seconds")
     began = time.perf_counter()
     start, solution, cov, seconds = _solved(config, file, name, kernel)
-    poses = _in_frame(np.asarray(solution.poses, np.float64), file)
-    start = _in_frame(np.asarray(start, np.float64), file)
+    poses, turn = _in_frame(np.asarray(solution.poses, np.float64), file)
+    start, _ = _in_frame(np.asarray(start, np.float64), file)
+    cov = turn @ cov @ turn.T
     report = _report(config, file, solution, name, seconds)
     report["wall_s"] = time.perf_counter() - began
     report["careful"] = said = _doubts(report, file, solution)
@@ -139,13 +140,14 @@ def _solved(
     return np.asarray(start), solution, np.asarray(cov, np.float64), seconds
 
 
-def _in_frame(poses: np.ndarray, file: GraphFile) -> np.ndarray:
-    """The poses moved as one so that the fixed one is where the file has it."""
+def _in_frame(poses: np.ndarray, file: GraphFile) -> tuple[np.ndarray, np.ndarray]:
+    """The poses moved as one so that the fixed one is where the file has it, and how that turns x, y and theta."""
     k = file.fixed
     at = np.zeros(POSE) if file.poses is None else file.poses[k]
     moved = compose(at, between(np.broadcast_to(poses[k], poses.shape), poses))
     moved[:, 2] = wrapped(moved[:, 2])
-    return moved
+    cos, sin = np.cos(at[2] - poses[k, 2]), np.sin(at[2] - poses[k, 2])
+    return moved, np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
 def _report(

@@ -15,7 +15,7 @@ from test_experiments import is_png
 from test_logs import write
 
 from jaxlocmap import Gaussian, Params, simulation
-from jaxlocmap.logs import read_trajectory, write_tum
+from jaxlocmap.logs import read_graph, read_trajectory, write_tum
 from jaxlocmap.mapping.ros import load_map
 from jaxlocmap.matching.storage import load_lines
 from jaxlocmap.poses import between as moved
@@ -62,7 +62,7 @@ def since_start(poses):
 
 
 def program(out, log, **settings):
-    settings = {"half_width": 10.0, "resolution": 0.1, "out": out} | settings
+    settings = {"half_width": 10.0, "resolution": 0.1, "closure": False, "out": out} | settings
     return slam.main(slam.SlamConfig(log=log, format="carmen", **settings))
 
 
@@ -216,3 +216,54 @@ def test_parameters_of_a_file_take_the_place_of_the_odometry(tmp_path, monkeypat
     assert float(seen["params"].blocks["match_std"]) == pytest.approx(0.05)
     assert seen["settings"].scanner_offset == (0.1, 0.0, 0.2)
     assert seen["settings"].max_range == 20.0
+
+
+@pytest.fixture(scope="module")
+def made_closed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("closed")
+    log = log_file(folder)
+    return folder, program(folder / "out", log, closure=True, submap_length=2.5, online=True)
+
+
+def test_closed_loops(made_closed):
+    folder, report = made_closed
+    poses = since_start(drive()[0])
+    estimate = read_trajectory(folder / "out" / "estimate.tum")
+    error = np.hypot(*(estimate.pose - poses)[:, :2].T)
+    assert error.max() < 0.15
+    said = report["closure"]
+    assert said["submaps"] >= 5
+    assert 1 <= said["kept"] <= said["accepted"] <= said["tried"]
+    assert said["converged"]
+    # Its covariances are those of the poses since the start.
+    with_covariance = read_trajectory(folder / "out" / "poses.csv")
+    np.testing.assert_allclose(with_covariance.pose, estimate.pose, atol=1e-9)
+    sigma = np.sqrt(with_covariance.cov[:, 0, 0] + with_covariance.cov[:, 1, 1])
+    assert sigma[0] == 0
+    assert report["sigma_position_end_m"] == pytest.approx(sigma[-1], rel=1e-5)
+    assert np.all(error[1:] < 5 * sigma[1:] + 0.02)
+
+
+def test_what_closed_loops_write(made_closed):
+    folder, report = made_closed
+    out = folder / "out"
+    graph = read_graph(out / "graph.g2o")
+    assert len(graph.ids) == report["closure"]["submaps"]
+    assert len(graph.loop_line) == report["closure"]["accepted"]
+    assert is_png(out / "graph.png")
+    assert is_png(out / "map.png")
+    online = read_trajectory(out / "online.tum")
+    assert len(online.time) == SCANS
+    # A map of lines to localise on, of the size that was asked for.
+    lines = load_lines(out / "lines.npz")
+    assert lines.half_width == 10.0
+    assert np.count_nonzero(lines.lines[..., 5]) > 500
+
+
+def test_words_on_loops():
+    said = {"accepted": 10, "kept": 10, "converged": True}
+    assert slam.loop_doubts({}) == []
+    assert slam.loop_doubts({"closure": said}) == []
+    assert "no loop was closed" in slam.loop_doubts({"closure": said | {"accepted": 0, "kept": 0}})[0]
+    assert "3 of 10 loops do not fit" in slam.loop_doubts({"closure": said | {"kept": 7}})[0]
+    assert "did not converge" in slam.loop_doubts({"closure": said | {"converged": False}})[0]

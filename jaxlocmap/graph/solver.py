@@ -127,7 +127,7 @@ def faults(graph: Graph, solution: Solution, start: jax.Array | None = None) -> 
     said = []
     for name, value in (*graph._asdict().items(), *([] if start is None else [("start", start)])):
         value = np.asarray(value)
-        wrong = ~np.isfinite(value).reshape(len(value), -1).all(axis=1)
+        wrong = ~np.isfinite(value).all(axis=tuple(range(1, value.ndim)))
         if wrong.any():
             said.append(f"{name}: {wrong.sum()} are not finite, the first number {np.argmax(wrong)}")
     for name, good in (("odometry", solution.good_odometry), ("loop", solution.good_loop)):

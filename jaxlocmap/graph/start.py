@@ -11,7 +11,7 @@ from jaxlocmap import checks
 from jaxlocmap._internal.linalg import Matrix
 from jaxlocmap._internal.trig import arctan2, sin_cos
 from jaxlocmap.graph import methods
-from jaxlocmap.graph.factors import Graph, check, root, walked
+from jaxlocmap.graph.factors import Graph, check, dead_reckoning, root, walked
 from jaxlocmap.graph.loop_space import System
 from jaxlocmap.graph.prefix import prefix_sum
 from jaxlocmap.se2 import POSE, wrap
@@ -31,7 +31,7 @@ def chordal(graph: Graph, first: jax.Array | None = None, *, method: str | None 
         method: how the linear systems are solved, as of `solve`.
 
     Returns:
-        (N, 3).
+        (N, 3); those of `dead_reckoning` where the graph does not tie all poses together.
 
     Source: Martinec & Pajdla 2007 (headings as chords); Carlone, Tron, Daniilidis & Dellaert 2015.
 
@@ -46,7 +46,8 @@ def chordal(graph: Graph, first: jax.Array | None = None, *, method: str | None 
 
 @functools.partial(jax.jit, static_argnames="method")
 def _chordal(graph: Graph, first: jax.Array, method: str) -> jax.Array:
-    return _places(graph, _headings(graph, first, method), first, method)
+    found = _places(graph, _headings(graph, first, method), first, method)
+    return jnp.where(jnp.all(jnp.isfinite(found)), found, dead_reckoning(graph, first))
 
 
 def _headings(graph: Graph, first: jax.Array, method: str) -> jax.Array:
