@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
+import scipy.stats
 from jax.test_util import check_grads
 
 from jaxlocmap import graph as pose_graph
@@ -224,6 +225,11 @@ def test_kernels_at_their_scale():
     assert float(Kernel("huber", 2.0).weight(jnp.array(16.0))) == pytest.approx(1 / 2)
     assert float(Kernel("dcs", 2.0).weight(jnp.array(6.0))) == pytest.approx(1 / 4)
     assert float(Kernel("gnc", 2.0).weight(jnp.array(4.1))) == 0
+
+
+@pytest.mark.parametrize("name", NAMES[1:-1])
+def test_usual_scales_count_a_loop_half_at_the_quantile(name):
+    assert float(Kernel(name).weight(jnp.array(scipy.stats.chi2.ppf(0.99, 3)))) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(

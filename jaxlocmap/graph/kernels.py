@@ -2,7 +2,8 @@
 
     objective = Σ odometry eᵀ Omega e + Σ loops rho(eᵀ Omega e)
 
-A step of Gauss-Newton weighs each loop by w = rho'. With s = eᵀ Omega e and the scale c, a standard deviation or some:
+A step of Gauss-Newton weighs each loop by w = rho'. With s = eᵀ Omega e and the scale c, by default such that w is 1/2
+at the 0.99 quantile of chi-square with 3 degrees of freedom (`gnc`: 1 below, 0 above):
 
 | kernel | rho(s) | w |
 |---|---|---|
@@ -28,14 +29,15 @@ import jax.numpy as jnp
 from jaxlocmap import checks
 
 GOOD = 11.344866730144373  # 0.99 of chi-square with 3 degrees of freedom: what a good loop stays below
-_SCALES = {
+_SCALES = {  # all count a loop half there, or decide
     "quadratic": math.inf,
-    "huber": math.sqrt(GOOD),
-    "cauchy": 1.0,
-    "geman_mcclure": math.sqrt(GOOD),
-    "dcs": 1.0,
+    "huber": math.sqrt(GOOD) / 2,
+    "cauchy": math.sqrt(GOOD),
+    "geman_mcclure": math.sqrt(GOOD / (math.sqrt(2) - 1)),
+    "dcs": GOOD / (2 * math.sqrt(2) - 1),
     "gnc": math.sqrt(GOOD),
 }
+NAMES = tuple(_SCALES)
 
 
 @jax.tree_util.register_dataclass

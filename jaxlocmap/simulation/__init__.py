@@ -3,6 +3,7 @@
 A world is data (walls, landmarks), so is the noise of the robot; both may differ from run to run under `vmap`.
 """
 
+from jaxlocmap.simulation.graphs import simulate_graph
 from jaxlocmap.simulation.robot import (
     Draws,
     detect,
@@ -61,6 +62,7 @@ __all__ = [
     "roll_out",
     "room",
     "simulate",
+    "simulate_graph",
     "simulate_scan",
     "targets",
 ]
