@@ -103,19 +103,9 @@ def _study(truth: jax.Array, graphs: graph.Graph, kernel: str, loops: int) -> di
 
 
 def _show(report: dict[str, Any]) -> None:
-    names = [
-        "false loops",
-        "kernel",
-        "NEES, last pose",
-        "band",
-        "median",
-        "RMSE m",
-        "precision",
-        "recall",
-        "converged",
-        "s",
-    ]
-    table = Table(*names, title=f"{report['graphs']} graphs, {report['poses']} poses, {report['loops']} true loops")
+    names = ["false", "kernel", "NEES", "95 % band", "median", "RMSE m", "precision", "recall", "conv.", "s"]
+    title = f"{report['graphs']} graphs, {report['poses']} poses, {report['loops']} true loops; NEES of the last pose"
+    table = Table(*names, title=title, title_justify="left")
     for study in report["studies"]:
         low, high = study["last_pose_anees_band_95"]
         table.add_row(

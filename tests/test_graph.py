@@ -463,6 +463,7 @@ def test_arguments_refused():
         (lambda: pose_graph.solve(graph, method="magic"), "method: expected one of"),
         (lambda: pose_graph.solve(graph, kernel="magic"), "kernel: expected one of"),
         (lambda: pose_graph.solve(graph, steps=0), "steps: expected at least 1, got 0"),
+        (lambda: pose_graph.solve(graph, tolerance=0.0), r"tolerance: expected a share inside \(0, 1\), got 0.0"),
         (lambda: pose_graph.solve(graph, jnp.zeros((3, 3))), "start: expected shape"),
         (lambda: pose_graph.marginals(graph, solution, frame="map"), "frame: expected one of"),
         (lambda: pose_graph.stack([]), "graphs: expected at least one, got none"),

@@ -42,18 +42,20 @@ class Found(NamedTuple):
     converged: jax.Array
 
 
-def descend(graph: Graph, start: jax.Array, kernel: Kernel, weights: jax.Array, method: str, steps: int) -> Found:
+def descend(
+    graph: Graph, start: jax.Array, kernel: Kernel, weights: jax.Array, method: str, steps: int, tolerance: float
+) -> Found:
     """The least objective from a start (N, 3), loops weighed by `weights` (L,) and the kernel."""
     edges, dtype = prepared(graph), start.dtype
-    tolerance = float(jnp.finfo(dtype).eps) ** (2 / 3)
+    rounding = float(jnp.finfo(dtype).eps) ** (2 / 3)
 
     def turn(now: _Search) -> _Search:
         step = gauss_newton(edges, graph.pair, now.poses, kernel, weights, method)
         usable = jnp.isfinite(step.objective) & jnp.isfinite(step.decrease)
         better = usable & ~(step.objective >= now.step.objective)
-        settled = usable & (step.decrease <= tolerance * (step.objective + tolerance))
+        settled = usable & (step.decrease <= tolerance * (step.objective + rounding))
         # One that settles above the best has found another, worse optimum, unless it is the same to rounding.
-        settled &= better | (step.objective <= now.step.objective * (1 + 10 * tolerance) + tolerance)
+        settled &= better | (step.objective <= now.step.objective * (1 + 10 * tolerance) + rounding)
         kept = better | settled
         best = jax.tree.map(lambda a, b: jnp.where(kept, a, b), (now.poses, step), (now.best, now.step))
         iterations = now.iterations + 1

@@ -44,6 +44,7 @@ def solve(
     kernel: Kernel | str = "quadratic",
     method: str | None = None,
     steps: int = 100,
+    tolerance: float | None = None,
 ) -> Solution:
     """Minimise Σ eᵀ Omega e of odometry and Σ rho(eᵀ Omega e) of loops over all poses but the first.
 
@@ -59,6 +60,8 @@ def solve(
         method: how linear systems are solved, static: "loop_space" for batches and up to some 150 loops, "scipy" or
             "sparsax" for large graphs (`sparse`); None chooses by size.
         steps: at most, static.
+        tolerance: > 0, static: it ends with the step that promises to lower the objective by less than this share; by
+            default all that its dtype tells apart, 4e-11 in float64, which derivatives need.
 
     Returns:
         `Solution`. A graph that has no finite optimum is flagged (`converged`, `finite`); `faults` says why in words.
@@ -67,7 +70,8 @@ def solve(
     system of the loops is that of an innovation).
 
     Raises:
-        ValueError: a wrong shape, a pair that is none of the graph, an unknown kernel or method, no step.
+        ValueError: a wrong shape, a pair that is none of the graph, an unknown kernel or method, no step, a
+            tolerance out of its range.
         ImportError: `sparsax` asked for where it cannot be used.
     """
     check(graph)
@@ -76,11 +80,17 @@ def solve(
     if start is not None:
         checks.shape("start", start, (graph.poses, POSE))
     kernel = Kernel(kernel) if isinstance(kernel, str) else kernel
-    return _solve(graph, start, kernel, methods.resolve(method, graph), steps)
+    finest = float(jnp.finfo(graph.odometry.dtype).eps) ** (2 / 3)
+    share = finest if tolerance is None else tolerance
+    if not 0 < share < 1:
+        raise ValueError(f"tolerance: expected a share inside (0, 1), got {tolerance}")
+    return _solve(graph, start, kernel, methods.resolve(method, graph), steps, share)
 
 
-@functools.partial(jax.jit, static_argnames=("method", "steps"))
-def _solve(graph: Graph, start: jax.Array | None, kernel: Kernel, method: str, steps: int) -> Solution:
+@functools.partial(jax.jit, static_argnames=("method", "steps", "tolerance"))
+def _solve(
+    graph: Graph, start: jax.Array | None, kernel: Kernel, method: str, steps: int, tolerance: float
+) -> Solution:
     if start is None:
         start = chordal(graph, method=method) if kernel.name == "quadratic" else dead_reckoning(graph)
     fixed = jax.lax.stop_gradient((graph, start, kernel))
@@ -91,7 +101,7 @@ def _solve(graph: Graph, start: jax.Array | None, kernel: Kernel, method: str, s
         begun, weights, taken = graduated(*fixed, method, steps)
         final = Kernel("quadratic")
         fixed = (fixed[0], begun, final)
-    found = descend(*fixed, weights, method, steps)
+    found = descend(*fixed, weights, method, steps, tolerance)
     poses = at_optimum(graph, start[0], found.poses, final, weights, method)
 
     edges = prepared(graph)
