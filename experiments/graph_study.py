@@ -13,11 +13,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import CONSOLE, command_line, output_folder, progress_bar, saved, write_report
+from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
 from rich.table import Table
 
 from jaxlocmap import graph, simulation
-from jaxlocmap.consistency import mean_over_runs
+from jaxlocmap.consistency import mean_over_runs, readable
 from jaxlocmap.graph.kernels import NAMES
 from jaxlocmap.monte_carlo.hosts import merge_kernels
 from jaxlocmap.se2 import POSE, wrap
@@ -37,6 +37,8 @@ class GraphStudyConfig:
     """Of a graph, that are true."""
     false: tuple[int, ...] = (0, 2, 10)
     """How many more are false; a study for each."""
+    write: bool = False
+    """Put the table into the README."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/graph_study")
@@ -67,6 +69,8 @@ def main(config: GraphStudyConfig) -> dict[str, Any]:
     report["wall_s"] = time.perf_counter() - began
     write_report(out, report)
     _show(report)
+    if config.write:
+        replace_table("graphs", _table(report))
     saved(out, "report.json")
     return report
 
@@ -102,6 +106,25 @@ def _study(truth: jax.Array, graphs: graph.Graph, kernel: str, loops: int) -> di
     }
 
 
+def _table(report: dict[str, Any]) -> str:
+    heads = (
+        "false loops",
+        "kernel",
+        "NEES of the last pose (3)",
+        "median (2.37)",
+        "position RMSE",
+        "precision, recall",
+    )
+    rows = [f"| {' | '.join(heads)} |", "|---" * len(heads) + "|"]
+    for study in report["studies"]:
+        rows.append(
+            f"| {study['false']} | {study['kernel']} | {readable(study['last_pose_anees'])} "
+            f"| {readable(study['last_pose_nees_median'])} | {study['rmse_position_m']:.3g} m "
+            f"| {study['precision']:.3f}, {study['recall']:.3f} |"
+        )
+    return "\n".join(rows)
+
+
 def _show(report: dict[str, Any]) -> None:
     names = ["false", "kernel", "NEES", "95 % band", "median", "RMSE m", "precision", "recall", "conv.", "s"]
     title = f"{report['graphs']} graphs, {report['poses']} poses, {report['loops']} true loops; NEES of the last pose"
@@ -111,9 +134,9 @@ def _show(report: dict[str, Any]) -> None:
         table.add_row(
             str(study["false"]),
             study["kernel"],
-            f"{study['last_pose_anees']:.3g}",
+            readable(study["last_pose_anees"]),
             f"{low:.3g}-{high:.3g}",
-            f"{study['last_pose_nees_median']:.3g}",
+            readable(study["last_pose_nees_median"]),
             f"{study['rmse_position_m']:.3g}",
             f"{study['precision']:.4f}",
             f"{study['recall']:.4f}",

@@ -23,11 +23,11 @@ import numpy as np
 import tyro
 from common import CONSOLE, command_line, count_rows, in_pieces, output_folder, params_or, saved, show, write_report
 from map_log import in_radians, make_map, ready
-from slam_loops import closed, drawn, loop_doubts, loop_rows, write_loops
+from slam_loops import closed, drawn, false_loops, loop_doubts, loop_rows, write_loops
 
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, init, plotting, run
 from jaxlocmap.consistency import readable
-from jaxlocmap.logs import Log, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
+from jaxlocmap.logs import Log, Trajectory, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
 from jaxlocmap.logs.relations import Relations, pairs
 from jaxlocmap.mapping import quality
 from jaxlocmap.mapping.ros import save_map
@@ -39,6 +39,7 @@ from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Matcher
 
 _ANY_SCANS = 2**30  # of a submap, whose travel ends it
+_SAME_STAMP = 1e-4  # s
 _PIECE = 91  # scans between two moves of the progress bar
 _OLDER = POSE  # entry of the state at which the anchor of the map begins
 _START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
@@ -129,6 +130,9 @@ def main(config: SlamConfig) -> dict[str, Any]:
         lines = None if state.submaps is None or known else np.asarray(state.submaps.lines)
     else:
         names += write_loops(out, loops, log, report)
+        if config.reference is not None:
+            reference = at_stamps(read_trajectory(config.reference), log.scan_time)
+            report["closure"]["false_kept"] = false_loops(loops, reference)
         if config.online:
             write_tum(out / "online.tum", log.scan_time, loops.online)
             names.append("online.tum")
@@ -182,6 +186,14 @@ def _scored(config: SlamConfig, log: Log) -> dict[str, Relations]:
 def closes(config: SlamConfig) -> bool:
     """Whether loops are looked for."""
     return config.closure and config.map is None
+
+
+def at_stamps(reference: Trajectory, time: np.ndarray) -> np.ndarray:
+    """The poses of a reference at the stamps of scans, (S, 3), NaN where it has none."""
+    place = np.clip(np.searchsorted(reference.time, time), 1, len(reference.time) - 1)
+    place -= time - reference.time[place - 1] < reference.time[place] - time
+    near = np.abs(reference.time[place] - time) < _SAME_STAMP
+    return np.where(near[:, None], reference.pose[place], np.nan)
 
 
 def believed(config: SlamConfig) -> Params:

@@ -20,10 +20,11 @@ from jaxlocmap.logs import Log, write_csv, write_g2o
 from jaxlocmap.matching import lines as line_grid
 from jaxlocmap.matching.normals import Points, surface_points
 from jaxlocmap.matching.submaps import BLOCKS
-from jaxlocmap.poses import compose
+from jaxlocmap.poses import between, compose, wrapped
 from jaxlocmap.types import Matcher, Scanner
 
 _KEPT = 0.5  # a loop of less weight is not kept
+_FALSE = (0.4, 0.1)  # m, rad: a loop farther off the reference than this is false
 
 
 class Loops(NamedTuple):
@@ -128,6 +129,32 @@ def write_loops(out: Path, loops: Loops, log: Log, report: dict[str, Any]) -> li
     return ["graph.g2o", "poses.csv", "graph.png"]
 
 
+def false_loops(loops: Loops, reference: np.ndarray) -> int:
+    """How many loops that were kept disagree with reference poses by more than 0.4 m or 0.1 rad.
+
+    A loop says how all scans of one submap lie to those of another; it is judged where they come nearest.
+
+    Args:
+        reference: (S, 3) m, m, rad, NaN where it is not known.
+    """
+    trail, attempts = loops.trail, loops.closed.attempts
+    accepted = np.flatnonzero(attempts.accepted)
+    kept = accepted[np.asarray(loops.closed.solution.weights)[: len(accepted)] > _KEPT]
+    known = np.isfinite(reference[:, 0])
+    count = 0
+    for k in kept:
+        a, b = (np.flatnonzero((trail.submap == submap) & known) for submap in attempts.pair[k])
+        if not (len(a) and len(b)):
+            continue
+        away = np.hypot(*np.moveaxis(reference[a, None, :2] - reference[None, b, :2], -1, 0))
+        i, j = np.unravel_index(np.argmin(away), away.shape)
+        moved = np.asarray(attempts.found.moved[k], np.float64)
+        said = between(trail.place[a[i]], compose(moved, trail.place[b[j]]))
+        off = between(reference[a[i]], reference[b[j]]) - said
+        count += bool(np.hypot(off[0], off[1]) > _FALSE[0] or abs(wrapped(off[2])) > _FALSE[1])
+    return count
+
+
 def loop_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Rows of the table."""
     if "closure" not in report:
@@ -137,6 +164,7 @@ def loop_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ("submaps", str(said["submaps"]), ""),
         ("loops tried, accepted, kept", f"{said['tried']}, {said['accepted']}, {said['kept']}", ""),
         ("closing loops", f"{said['seconds']:.1f} s", ""),
+        *([("false loops kept", str(said["false_kept"]), "0")] if "false_kept" in said else []),
     ]
 
 

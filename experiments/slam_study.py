@@ -18,6 +18,7 @@ from common import (
     command_line,
     output_folder,
     progress_bar,
+    replace_table,
     saved,
     scenario_of,
     scenario_world,
@@ -62,6 +63,8 @@ class SlamStudyConfig:
     """How loops count that do not fit the others."""
     loop_scale: float = 1.0
     """Standard deviations of loops, times this."""
+    write: bool = False
+    """Put the table into the README."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/slam_study")
@@ -113,6 +116,8 @@ def main(config: SlamStudyConfig) -> dict[str, Any]:
     seconds = study.scenario.dt * config.match_every
     plotting.slam_figure(out / "slam.png", np.stack(scores.before), np.stack(scores.after), seconds, config.scenario)
     _show(report)
+    if config.write:
+        replace_table(f"slam-{config.scenario}", _table(report))
     saved(out, "report.json", "slam.png")
     return report
 
@@ -259,6 +264,16 @@ def _summary(scores: Scores) -> dict[str, Any]:
         "false_loops_refused": scores.false_refused,
         "not_converged": scores.not_converged,
     }
+
+
+def _table(report: dict[str, Any]) -> str:
+    rows = ["| loops | position RMSE | 1 sigma | heading RMSE | ANEES of all poses (3) |", "|---|---|---|---|---|"]
+    for name, what in (("before", "open"), ("after", "closed")):
+        rows.append(
+            f"| {what} | {report[f'{name}_rmse_position_m']:.3f} m | {report[f'{name}_sigma_position_m']:.3f} m "
+            f"| {report[f'{name}_rmse_yaw_rad']:.4f} rad | {readable(report[f'{name}_anees'])} |"
+        )
+    return "\n".join(rows)
 
 
 def _show(report: dict[str, Any]) -> None:
