@@ -29,8 +29,9 @@ from report_table import innovation_rows, pose_rows, print_verdicts
 
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, consistency, init, plotting, run
 from jaxlocmap.consistency import readable
-from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline, write_tum
+from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline, write_csv, write_tum
 from jaxlocmap.monte_carlo.hosts import merge_kernels
+from jaxlocmap.smoothing import smooth
 
 _PIECE = 2000  # steps between two moves of the progress bar
 
@@ -64,6 +65,8 @@ class LocalizeConfig:
     the robot is taken to stand."""
     start: tuple[float, float, float] | None = None
     """Pose to start from, m, m, rad; by default the first true pose."""
+    smooth: bool = False
+    """Also correct every pose by what came after."""
     seed: int = 0
     """Nothing here is random; every program has it."""
     out: Path = Path("out/localize")
@@ -100,6 +103,12 @@ def main(config: LocalizeConfig) -> dict[str, Any]:
             CONSOLE.print(f"careful: {sentence}")
         info = filter_log(params, prior, timeline.inputs, log.landmarks, settings)
         report = judge(log, timeline, info, settings)
+        if config.smooth:
+            smoothed = _smoothed(params, info.belief, timeline.inputs, config=settings)
+            report["smoothed"] = judge_smoothed(timeline, smoothed)
+            last = np.append(np.diff(timeline.time) > 0, True)
+            stamps, poses, cov = timeline.time[last], smoothed.mean[last], smoothed.cov[last]
+            write_csv(out / "smoothed.csv", stamps, np.asarray(poses), np.asarray(cov))
     report["careful"] = said
     report["params"] = params.numbers()
     _write(out, log, timeline, info, report)
@@ -215,6 +224,22 @@ def judge(log: Log, timeline: Timeline, info: Info, config: Config) -> dict[str,
     }
 
 
+_smoothed = jax.jit(smooth, static_argnames="config")
+
+
+def judge_smoothed(timeline: Timeline, smoothed: Gaussian) -> dict[str, Any]:
+    """What the library's `judge` says of the smoothed poses."""
+    report = consistency.judge(
+        timeline.truth,
+        np.asarray(smoothed.mean),
+        np.asarray(smoothed.cov),
+        time=timeline.time - timeline.time[0],
+        valid=timeline.truth_valid,
+    )
+    names = ("rmse_position_m", "rmse_yaw_rad", "anees", "nees_median", "coverage_95", "verdict")
+    return {name: report[name] for name in names}
+
+
 def _write(out: Path, log: Log, timeline: Timeline, info: Info, report: dict[str, Any]) -> None:
     write_report(out, report)
     last = np.append(np.diff(timeline.time) > 0, True)  # of the steps at one stamp
@@ -235,7 +260,7 @@ def _write(out: Path, log: Log, timeline: Timeline, info: Info, report: dict[str
         title=f"{log.name}: position RMSE {report['rmse_position_m']:.3f} m" if judged else log.name,
     )
     _print(report, judged)
-    saved(out, *files)
+    saved(out, *files, *(["smoothed.csv"] if "smoothed" in report else []))
 
 
 def _print(report: dict[str, Any], judged: bool) -> None:
@@ -251,6 +276,13 @@ def _print(report: dict[str, Any], judged: bool) -> None:
             ("ANEES at observations", readable(report["anees_at_observations"]), "3"),
             ("median NEES", readable(report["nees_median"]), f"{consistency.chi2_quantile(0.5, 3):.2f}"),
             *pose_rows(report),
+        ]
+    if judged and "smoothed" in report:
+        after = report["smoothed"]
+        rows += [
+            ("smoothed: position RMSE", f"{after['rmse_position_m']:.3f} m", ""),
+            ("smoothed: heading RMSE", f"{after['rmse_yaw_rad']:.4f} rad", ""),
+            ("smoothed: average NEES", readable(after["anees"]), "3"),
         ]
     show(report["log"], rows + count_rows(report["counts"] | report["left_out"]))
     print_verdicts(report)

@@ -14,7 +14,7 @@ LAYERS = (
     ("matching",),
     ("graph",),
     ("step",),
-    ("pipeline",),
+    ("pipeline", "smoothing"),
     ("simulation",),
     ("consistency", "logs"),
     ("tuning", "plotting"),

@@ -15,7 +15,7 @@ from test_experiments import is_png
 from test_logs import write
 
 from jaxlocmap import Gaussian, Params, simulation
-from jaxlocmap.logs import read_graph, read_trajectory, write_tum
+from jaxlocmap.logs import Trajectory, read_graph, read_trajectory, write_tum
 from jaxlocmap.mapping.ros import load_map
 from jaxlocmap.matching.storage import load_lines
 from jaxlocmap.poses import between as moved
@@ -267,3 +267,26 @@ def test_words_on_loops():
     assert "no loop was closed" in slam.loop_doubts({"closure": said | {"accepted": 0, "kept": 0}})[0]
     assert "3 of 10 loops do not fit" in slam.loop_doubts({"closure": said | {"kept": 7}})[0]
     assert "did not converge" in slam.loop_doubts({"closure": said | {"converged": False}})[0]
+
+
+def test_false_loops_are_counted(made_closed, monkeypatch):
+    """Against the true poses none is false; against poses of which every other half is a metre aside, some are."""
+    folder, _ = made_closed
+    loops = []
+    kept = slam.closed
+    monkeypatch.setattr(slam, "closed", lambda *args: loops.append(kept(*args)) or loops[-1])
+    write_tum(folder / "truth.tum", 10.0 + np.arange(SCANS), drive()[0])
+    report = program(
+        folder / "again", folder / "a.log", closure=True, submap_length=2.5, reference=folder / "truth.tum"
+    )
+    assert report["closure"]["false_kept"] == 0
+    aside = drive()[0] + np.where(np.arange(SCANS) > SCANS / 2, 1.0, 0.0)[:, None] * [1, 0, 0]
+    assert slam.false_loops(loops[0], aside) >= 1
+    assert slam.false_loops(loops[0], np.full((SCANS, 3), np.nan)) == 0
+
+
+def test_poses_at_the_stamps_of_scans():
+    reference = Trajectory(np.array([1.0, 2.0, 3.0]), np.arange(9.0).reshape(3, 3), None, {})
+    found = slam.at_stamps(reference, np.array([0.5, 1.0, 2.00005, 2.6, 3.0, 9.0]))
+    np.testing.assert_array_equal(np.isnan(found[:, 0]), [True, False, False, True, False, True])
+    np.testing.assert_array_equal(found[[1, 2, 4]], reference.pose)
