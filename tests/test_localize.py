@@ -16,7 +16,7 @@ from programs import Enough, Recorder
 
 from jaxlocmap import Config, Info, Inputs, Params
 from jaxlocmap.filters import ekf
-from jaxlocmap.logs import Log, Timeline
+from jaxlocmap.logs import Log, Timeline, read_trajectory
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import common
@@ -343,3 +343,15 @@ def test_what_is_shown(monkeypatch):
         ("p", "", ""),
         *dropped,
     ]
+
+
+def test_smoothed_poses(monkeypatch, tmp_path, x64):
+    """What the option adds: the report's entry, and poses with covariances that read back and are more certain."""
+    monkeypatch.setattr(localize, "read", Recorder(made_log()))
+    config = localize.LocalizeConfig(log=Path("a.log"), format="woods", out=tmp_path, smooth=True, gate=None)
+    report = localize.main(config)
+    assert set(report["smoothed"]) >= {"rmse_position_m", "rmse_yaw_rad", "anees"}
+    poses = read_trajectory(tmp_path / "smoothed.csv")
+    assert len(poses.time) == len(read_trajectory(tmp_path / "estimate.tum").time)
+    assert np.all(np.linalg.eigvalsh(poses.cov) > -1e-12)
+    assert "smoothed" not in localize.main(dataclasses.replace(config, smooth=False))
