@@ -99,7 +99,7 @@ def main(config: SlamStudyConfig) -> dict[str, Any]:
             raise ValueError(f"{name}: expected a finite number > 0, got {getattr(config, name)}")
     merge_kernels()
     began = time.perf_counter()
-    study = _Study(config)
+    study = SlamDrives(config)
     runs = min(config.runs, 2) if config.quick else config.runs
     CONSOLE.print(f"{runs} runs of {config.scenario}, {study.scenario.steps} steps each; compiling takes some seconds")
     scores = Scores()
@@ -122,7 +122,7 @@ def main(config: SlamStudyConfig) -> dict[str, Any]:
     return report
 
 
-class _Study:
+class SlamDrives:
     """The simulation and the filter, compiled once, and the scoring of a drive."""
 
     def __init__(self, config: SlamStudyConfig) -> None:
@@ -135,12 +135,12 @@ class _Study:
             v=usual.v * times, w=usual.w * times, heading=usual.heading * times, scan=config.scan_noise
         )
         world = scenario_world(scenario)
-        self._world = world._replace(landmarks=world.landmarks[:0])
+        self.world = world._replace(landmarks=world.landmarks[:0])
         self._matcher = Matcher(period=config.match_every, gap=GAP)
         settings = self.scenario.config(motion="euler", gate_probability=0.99, grid=False)
         self._settings: Config = dataclasses.replace(settings, matcher=self._matcher)
         own = simulation.own_params(self._noise, self.scenario)
-        self._params: Params = with_defaults(own, std=config.scan_noise)
+        self.params: Params = with_defaults(own, std=config.scan_noise)
         self.drives = jax.jit(jax.vmap(self._drive))
         scanner = self._settings.scanner(self.scenario.beam_angles())
         self._points = jax.jit(
@@ -154,12 +154,12 @@ class _Study:
         start_key, key = jax.random.split(key)
         prior: Gaussian = self.scenario.prior()
         start = simulation.draw_start(start_key, prior, scenario=self.scenario)
-        truth, inputs = simulation.simulate(key, self._world, self._noise, start, scenario=self.scenario)
+        truth, inputs = simulation.simulate(key, self.world, self._noise, start, scenario=self.scenario)
         _, report = run(
-            self._params,
+            self.params,
             init(prior, config=self._settings),
             inputs,
-            landmarks=self._world.landmarks,
+            landmarks=self.world.landmarks,
             beam_angles=self.scenario.beam_angles(),
             config=self._settings,
             collect=lambda state, info, aside: info.match,
@@ -167,24 +167,29 @@ class _Study:
         due = slice(0, None, self._matcher.period)
         return jax.tree.map(lambda x: x[due], (truth.pose, inputs.ranges, report))
 
-    def score(self, scores: Scores, truth: np.ndarray, ranges: np.ndarray, report: Any) -> None:
-        """Close the loops of one drive and add its scores."""
-        trail, truth = trail_of(report), truth.astype(np.float64)
-        std, scale, _ = (jnp.asarray(self._params.block(block), jnp.float32) for block in BLOCKS)
+    def closed(self, truth: np.ndarray, ranges: np.ndarray, report: Any) -> tuple[Trail, Closed]:
+        """The trail of one drive, and its loops closed, the first anchor given. In float64."""
+        trail = trail_of(report)
+        std, scale, _ = (jnp.asarray(self.params.block(block), jnp.float32) for block in BLOCKS)
         points = self._points(jnp.asarray(ranges, jnp.float32))
-        first = truth[trail.begun[0]]
         with jax.enable_x64(True):
-            closed = close_loops(
+            return trail, close_loops(
                 trail,
                 points,
                 std,
                 scale,
                 spec=self._matcher.spec,
                 closure=Closure(scale=self._config.loop_scale),
-                first=first,
+                first=truth[trail.begun[0]].astype(np.float64),
                 kernel=Kernel(self._config.kernel),
             )
-            alone = _without_loops(closed)
+
+    def score(self, scores: Scores, truth: np.ndarray, ranges: np.ndarray, report: Any) -> None:
+        """Close the loops of one drive and add its scores."""
+        trail, closed = self.closed(truth, ranges, report)
+        truth = truth.astype(np.float64)
+        with jax.enable_x64(True):
+            alone = without_loops(closed)
             for into, one in ((scores.before, alone), (scores.after, closed)):
                 into.append(_scored(trail, one, truth))
         anchors = truth[trail.begun]
@@ -210,7 +215,7 @@ class _Study:
         scores.false_refused += int(np.sum(false & ~accepted))
 
 
-def _without_loops(closed: Closed) -> Closed:
+def without_loops(closed: Closed) -> Closed:
     """The same trail with its loops left open."""
     graph = closed.graph._replace(loop_information=0 * closed.graph.loop_information)
     return closed._replace(graph=graph, solution=solve(graph, dead_reckoning(graph, closed.solution.poses[0])))
