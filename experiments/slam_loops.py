@@ -132,7 +132,8 @@ def write_loops(out: Path, loops: Loops, log: Log, report: dict[str, Any]) -> li
 def false_loops(loops: Loops, reference: np.ndarray) -> int:
     """How many loops that were kept disagree with reference poses by more than 0.4 m or 0.1 rad.
 
-    A loop says how all scans of one submap lie to those of another; it is judged where they come nearest.
+    A loop says how the scans of one submap lie to those of another; it is judged where they come nearest, among the
+    scans that the filter let in: of others it knows the odometry alone.
 
     Args:
         reference: (S, 3) m, m, rad, NaN where it is not known.
@@ -140,7 +141,7 @@ def false_loops(loops: Loops, reference: np.ndarray) -> int:
     trail, attempts = loops.trail, loops.closed.attempts
     accepted = np.flatnonzero(attempts.accepted)
     kept = accepted[np.asarray(loops.closed.solution.weights)[: len(accepted)] > _KEPT]
-    known = np.isfinite(reference[:, 0])
+    known = np.isfinite(reference[:, 0]) & trail.drawn
     count = 0
     for k in kept:
         a, b = (np.flatnonzero((trail.submap == submap) & known) for submap in attempts.pair[k])
