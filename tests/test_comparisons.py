@@ -624,20 +624,34 @@ def test_the_studies_of_matching_of_the_readme(monkeypatch, tmp_path, quick):
 def test_the_matched_logs_of_the_readme(monkeypatch, tmp_path):
     score = {"scored": 9, "translation_m": 0.1234, "translation_median_m": 0.05}
     score |= {"rotation_deg": 1.234, "rotation_median_deg": 0.5}
-    report = {"relations": score, "revisits": score | {"scored": 7}, "matched": 99, "tried": 100, "ms_per_scan": 1.26}
-    monkeypatch.setattr(readme_tables.slam, "main", ran := Recorder(report))
+    report = {"relations": score, "revisits": score | {"scored": 7}, "wall_s": 12.6}
+    closure = {"kept": 21, "false_kept": 2}
+    ran = []
+
+    def slam_main(config):
+        ran.append(config)
+        return report | ({"closure": closure} if config.closure else {})
+
+    monkeypatch.setattr(readme_tables.slam, "main", slam_main)
     folder = tmp_path / "carmen" / "raw_odom"
     folder.mkdir(parents=True)
     poses = {"12.5": {"x": 1.0, "y": 2.0, "theta": 0.5, "range": []}, "9.5": {"x": 0.0, "y": 0.0, "theta": 0.0}}
     text = json.dumps({"map": poses}).encode()
-    (folder / "csail_corrected_log.json.gz").write_bytes(gzip.compress(text))
+    for name in ("intel", "csail"):
+        (folder / f"{name}_corrected_log.json.gz").write_bytes(gzip.compress(text))
     rows = rows_of(readme_tables._slam(readme_tables.TablesConfig(), tmp_path, tmp_path))
-    intel, csail = (args[0] for args, _ in ran.calls)
-    assert (intel.log.name, intel.relations.name, intel.reference) == ("intel-raw.log.gz", "intel.relations", None)
-    assert (csail.log.name, csail.relations, csail.reference) == ("csail-raw.log.gz", None, tmp_path / "reference.tum")
-    assert rows[0] == ["Intel", "relations", "9", "0.123 m, 0.050 m", "1.23°, 0.50°", "99.0 %", "1.3 ms"]
-    assert rows[1][:3] == ["CSAIL", "revisits", "7"]
-    read = read_trajectory(csail.reference)
+    reference = tmp_path / "reference.tum"
+    assert [(c.log.name, c.relations and c.relations.name, c.reference, c.closure) for c in ran] == [
+        ("intel-raw.log.gz", "intel.relations", reference, True),
+        ("intel-raw.log.gz", "intel.relations", reference, False),
+        ("csail-raw.log.gz", None, reference, True),
+        ("csail-raw.log.gz", None, reference, False),
+    ]
+    assert len({c.out for c in ran}) == 4
+    assert rows[0] == ["Intel", "closed", "relations, 9", "0.123 m, 0.050 m", "1.23°, 0.50°", "21, 2", "13"]
+    assert rows[1][1:3] + rows[1][5:] == ["`--no-closure`", "relations, 9", "–", "13"]
+    assert rows[2][:3] == ["CSAIL", "closed", "revisits, 7"]
+    read = read_trajectory(reference)
     np.testing.assert_allclose(read.time, [9.5, 12.5])
     np.testing.assert_allclose(read.pose, [[0, 0, 0], [1, 2, 0.5]])
 
