@@ -76,8 +76,6 @@ def use_all_cores(count: int | None = None) -> int:
     here = cores()
     if count is not None:
         check_count("devices", count)
-    # Every device may wait in LAPACK for a thread that computes: with as many threads as devices, all wait for ever.
-    os.environ.setdefault("PJRT_NPROC", str((count or here) + 1))
     with contextlib.suppress(RuntimeError):  # started already
         jax.config.update("jax_num_cpu_devices", min(count or here, here))
     devices = jax.local_devices()
