@@ -70,7 +70,7 @@ def main(config: GraphConfig) -> dict[str, Any]:
     jax.config.update("jax_enable_x64", True)
     kernel = Kernel(config.kernel, config.scale)
     file = read_graph(config.file, isam=config.isam)
-    truth = None if config.judge is None else _truth(config.judge)
+    truth = None if config.judge is None else _truth(config.judge, file)
     name = config.start or ("chordal" if config.kernel == "quadratic" else "odometry")
     if name == "file" and file.poses is None:
         raise ValueError(f"{config.file}: expected vertices to start from, got edges alone")
@@ -84,6 +84,7 @@ def main(config: GraphConfig) -> dict[str, Any]:
     report["wall_s"] = time.perf_counter() - began
     report["careful"] = said = _doubts(report, file, solution)
     if truth is not None:
+        truth = truth._replace(pose=_as_one(truth.pose, truth.pose[_fixed(truth, file)[0]], poses[file.fixed]))
         report["judged"] = _judged(truth, file, poses, cov)
     stamps = file.ids.astype(float)
     write_g2o(out / "graph.g2o", file.graph, poses, file.ids, fixed=file.fixed)
@@ -91,7 +92,7 @@ def main(config: GraphConfig) -> dict[str, Any]:
     write_tum(out / "poses.tum", stamps, poses)
     weights, ends = np.asarray(solution.weights), np.asarray(file.graph.pair)
     title = f"{config.file.name}: χ² {readable(report['chi2_start'])} before, {readable(report['chi2'])} after"
-    seen = None if truth is None else _aligned(truth, file, poses)[1]
+    seen = None if truth is None else truth.pose
     plotting.graph_figure(out / "graph.png", poses, cov, ends, weights, before=start, truth=seen, title=title)
     write_report(out, report)
     for sentence in said:
@@ -101,13 +102,23 @@ def main(config: GraphConfig) -> dict[str, Any]:
     return report
 
 
-def _truth(path: Path) -> Trajectory:
-    if Path(path.name.removesuffix(".gz")).suffix not in _GRAPHS:
-        return read_trajectory(path)
-    file = read_graph(path)
-    if file.poses is None:
-        raise ValueError(f"{path}: expected vertices with true poses, got edges alone")
-    return Trajectory(file.ids.astype(float), file.poses, None, {})
+def _truth(path: Path, file: GraphFile) -> Trajectory:
+    """True poses with the graph's ids for stamps, that of the vertex that stays among them."""
+    if Path(path.name.removesuffix(".gz")).suffix in _GRAPHS:
+        true = read_graph(path)
+        if true.poses is None:
+            raise ValueError(f"{path}: expected vertices with true poses, got edges alone")
+        truth = Trajectory(true.ids.astype(float), true.poses, None, {})
+    else:
+        truth = read_trajectory(path)
+    if not len(_fixed(truth, file)):
+        raise ValueError(f"judge: expected the true pose of vertex {file.ids[file.fixed]}, which stays, got none")
+    return truth
+
+
+def _fixed(truth: Trajectory, file: GraphFile) -> np.ndarray:
+    """Where in the truth the vertex that stays is."""
+    return np.flatnonzero(truth.time == file.ids[file.fixed])
 
 
 def _solved(
@@ -144,10 +155,16 @@ def _in_frame(poses: np.ndarray, file: GraphFile) -> tuple[np.ndarray, np.ndarra
     """The poses moved as one so that the fixed one is where the file has it, and how that turns x, y and theta."""
     k = file.fixed
     at = np.zeros(POSE) if file.poses is None else file.poses[k]
-    moved = compose(at, between(np.broadcast_to(poses[k], poses.shape), poses))
-    moved[:, 2] = wrapped(moved[:, 2])
+    moved = _as_one(poses, poses[k], at)
     cos, sin = np.cos(at[2] - poses[k, 2]), np.sin(at[2] - poses[k, 2])
     return moved, np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
+def _as_one(poses: np.ndarray, one: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Poses moved together so that one of them comes to lie elsewhere."""
+    moved = compose(at, between(np.broadcast_to(one, poses.shape), poses))
+    moved[:, 2] = wrapped(moved[:, 2])
+    return moved
 
 
 def _report(
@@ -214,22 +231,10 @@ def _doubts(report: dict[str, Any], file: GraphFile, solution: Solution) -> list
     return said
 
 
-def _aligned(truth: Trajectory, file: GraphFile, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ids of the truth that the graph has, and the truth moved so that the fixed pose is where the graph has it."""
-    k = file.fixed
-    at = np.flatnonzero(truth.time == file.ids[k])
-    if not len(at):
-        raise ValueError(f"judge: expected the true pose of vertex {file.ids[k]}, which stays, got none")
-    true = truth.pose[at[0]]
-    moved = compose(poses[k], between(np.broadcast_to(true, truth.pose.shape), truth.pose))
-    return truth.time, moved
-
-
 def _judged(truth: Trajectory, file: GraphFile, poses: np.ndarray, cov: np.ndarray) -> dict[str, Any]:
-    stamps, moved = _aligned(truth, file, poses)
     rest = np.arange(len(poses)) != file.fixed
     estimate = Trajectory(file.ids[rest].astype(float), poses[rest], cov[rest], {})
-    pairs = pair([Trajectory(stamps, moved, None, {})], [estimate], ["poses.csv"], max_gap=0.0)
+    pairs = pair([truth], [estimate], ["poses.csv"], max_gap=0.0)
     return judge(pairs.truth, pairs.mean, pairs.cov, time=pairs.time, valid=pairs.valid)
 
 

@@ -237,7 +237,7 @@ def _false_loops(path: Path, seed: int) -> list[dict[str, Any]]:
         began = time.perf_counter()
         optimizer.optimize()
         took = time.perf_counter() - began
-        seconds = _by_turns(3, ours=lambda: jax.block_until_ready(graph.solve(spoiled, kernel="gnc")))["ours"]  # noqa: B023
+        seconds = _by_turns(3, ours=lambda g=spoiled: jax.block_until_ready(graph.solve(g, kernel="gnc")))["ours"]
         theirs = np.asarray(optimizer.getWeights())[g.poses :] > 0.5
         off = np.asarray(solution.poses) - clean
         rows.append(

@@ -28,7 +28,7 @@ from slam_loops import closed, drawn, false_loops, loop_doubts, loop_rows, write
 from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, init, plotting, run
 from jaxlocmap.consistency import readable
 from jaxlocmap.logs import Log, Trajectory, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
-from jaxlocmap.logs.relations import Relations, pairs
+from jaxlocmap.logs.relations import Relations, find_stamps, pairs
 from jaxlocmap.mapping import quality
 from jaxlocmap.mapping.ros import save_map
 from jaxlocmap.matching import submaps
@@ -39,7 +39,6 @@ from jaxlocmap.se2 import POSE
 from jaxlocmap.types import Matcher
 
 _ANY_SCANS = 2**30  # of a submap, whose travel ends it
-_SAME_STAMP = 1e-4  # s
 _PIECE = 91  # scans between two moves of the progress bar
 _OLDER = POSE  # entry of the state at which the anchor of the map begins
 _START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
@@ -190,10 +189,8 @@ def closes(config: SlamConfig) -> bool:
 
 def at_stamps(reference: Trajectory, time: np.ndarray) -> np.ndarray:
     """The poses of a reference at the stamps of scans, (S, 3), NaN where it has none."""
-    place = np.clip(np.searchsorted(reference.time, time), 1, len(reference.time) - 1)
-    place -= time - reference.time[place - 1] < reference.time[place] - time
-    near = np.abs(reference.time[place] - time) < _SAME_STAMP
-    return np.where(near[:, None], reference.pose[place], np.nan)
+    place, known = find_stamps(reference.time, time)
+    return np.where(known[:, None], reference.pose[place], np.nan)
 
 
 def believed(config: SlamConfig) -> Params:

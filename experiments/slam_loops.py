@@ -50,7 +50,7 @@ def closed(params: Params, log: Log, info: Info, settings: Config, config: Any) 
         raise ValueError("settings.matcher: expected a Matcher, got None")
     began = time.perf_counter()
     trail = trail_of(info.match)
-    points = surfaces(log, settings)
+    points = surfaces(log.scan, log.beam_angles, settings)
     std, scale, _ = (jnp.asarray(params.block(block), jnp.float32) for block in BLOCKS)
     with jax.enable_x64(True), progress_bar("closing loops", trail.submaps) as progress:
         first = np.asarray(config.start, np.float64)
@@ -72,11 +72,11 @@ def closed(params: Params, log: Log, info: Info, settings: Config, config: Any) 
     return Loops(trail, found, poses, cov, online, time.perf_counter() - began)
 
 
-def surfaces(log: Log, settings: Config) -> Points:
-    """The points of all scans, (S, B, ...)."""
+def surfaces(ranges: np.ndarray, beam_angles: Any, settings: Config) -> Points:
+    """The points of all scans (S, B), (S, B, ...)."""
     matcher = settings.matcher or Matcher()
-    scanner = settings.scanner(jnp.asarray(log.beam_angles, jnp.float32))
-    return _surfaces(jnp.asarray(log.scan, jnp.float32), scanner, matcher.range_std, matcher.gap)
+    scanner = settings.scanner(jnp.asarray(beam_angles, jnp.float32))
+    return _surfaces(jnp.asarray(ranges, jnp.float32), scanner, matcher.range_std, matcher.gap)
 
 
 @functools.partial(jax.jit, static_argnames=("std", "gap"))
@@ -87,7 +87,7 @@ def _surfaces(ranges: jax.Array, scanner: Scanner, std: float, gap: float) -> Po
 def drawn(log: Log, settings: Config, poses: np.ndarray, counts: np.ndarray, half_width: float) -> np.ndarray:
     """One map of lines of all scans that count, (rows, columns, 6), about the start."""
     matcher = Matcher(half_width=half_width, resolution=(settings.matcher or Matcher()).resolution)
-    points = surfaces(log, settings)
+    points = surfaces(log.scan, log.beam_angles, settings)
 
     @jax.jit
     def all_of(poses: jax.Array, counts: jax.Array, points: Points) -> jax.Array:
@@ -150,10 +150,20 @@ def false_loops(loops: Loops, reference: np.ndarray) -> int:
         away = np.hypot(*np.moveaxis(reference[a, None, :2] - reference[None, b, :2], -1, 0))
         i, j = np.unravel_index(np.argmin(away), away.shape)
         moved = np.asarray(attempts.found.moved[k], np.float64)
-        said = between(trail.place[a[i]], compose(moved, trail.place[b[j]]))
-        off = between(reference[a[i]], reference[b[j]]) - said
-        count += bool(np.hypot(off[0], off[1]) > _FALSE[0] or abs(wrapped(off[2])) > _FALSE[1])
+        count += bool(is_false(trail, reference, a[i], b[j], moved))
     return count
+
+
+def is_false(trail: Trail, reference: np.ndarray, a: Any, b: Any, moved: np.ndarray) -> np.ndarray:
+    """Whether what loops say of how scans b lie to scans a is more than 0.4 m or 0.1 rad off reference poses, (...,).
+
+    Args:
+        reference: (S, 3) m, m, rad.
+        a, b: (...,) scans of the older and the younger submap.
+        moved: (..., 3) m, m, rad: the younger anchor in the frame of the older one.
+    """
+    off = between(reference[a], reference[b]) - between(trail.place[a], compose(moved, trail.place[b]))
+    return (np.hypot(off[..., 0], off[..., 1]) > _FALSE[0]) | (np.abs(wrapped(off[..., 2])) > _FALSE[1])
 
 
 def loop_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:

@@ -26,6 +26,7 @@ from common import (
     with_known_start,
     write_report,
 )
+from slam_loops import is_false, surfaces
 
 from jaxlocmap import Config, Gaussian, Matcher, Params, consistency, init, plotting, run, simulation
 from jaxlocmap.consistency import readable
@@ -33,14 +34,12 @@ from jaxlocmap.graph import dead_reckoning, solve
 from jaxlocmap.graph.closure import Closed, Closure, close_loops, scan_poses
 from jaxlocmap.graph.kernels import Kernel
 from jaxlocmap.graph.trail import Trail, trail_of
-from jaxlocmap.matching.normals import surface_points
 from jaxlocmap.matching.submaps import BLOCKS, with_defaults
 from jaxlocmap.monte_carlo.hosts import merge_kernels
-from jaxlocmap.poses import between, compose, wrapped
+from jaxlocmap.poses import between, wrapped
 from jaxlocmap.se2 import POSE
 
 _CHUNK = 5  # runs that are simulated at once
-_FALSE = (0.4, 0.1)  # m, rad: a loop farther off the truth than this is false
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,12 +141,6 @@ class SlamDrives:
         own = simulation.own_params(self._noise, self.scenario)
         self.params: Params = with_defaults(own, std=config.scan_noise)
         self.drives = jax.jit(jax.vmap(self._drive))
-        scanner = self._settings.scanner(self.scenario.beam_angles())
-        self._points = jax.jit(
-            jax.vmap(
-                lambda ranges: surface_points(ranges, self._matcher.range_std, scanner=scanner, gap=self._matcher.gap)
-            )
-        )
 
     def _drive(self, key: jax.Array) -> Any:
         """One drive at the steps at which a scan is due: true poses, scans, reports."""
@@ -171,7 +164,7 @@ class SlamDrives:
         """The trail of one drive, and its loops closed, the first anchor given. In float64."""
         trail = trail_of(report)
         std, scale, _ = (jnp.asarray(self.params.block(block), jnp.float32) for block in BLOCKS)
-        points = self._points(jnp.asarray(ranges, jnp.float32))
+        points = surfaces(ranges, self.scenario.beam_angles(), self._settings)
         with jax.enable_x64(True):
             return trail, close_loops(
                 trail,
@@ -204,8 +197,7 @@ class SlamDrives:
         scores.loops.append(_nees(between(anchors[i], anchors[j]) - moved, cov)[accepted])
         # Judged where they were matched, at the submaps' middles: an anchor lies metres from there.
         a, b = trail.middle[i], trail.middle[j]
-        off = between(truth[a], truth[b]) - between(trail.place[a], compose(moved, trail.place[b]))
-        false = (np.hypot(off[:, 0], off[:, 1]) > _FALSE[0]) | (np.abs(wrapped(off[:, 2])) > _FALSE[1])
+        false = is_false(trail, truth, a, b, moved)
         kept = np.zeros_like(accepted)
         kept[np.flatnonzero(accepted)] = np.asarray(closed.solution.weights)[: accepted.sum()] > 0.5
         scores.tried += len(accepted)

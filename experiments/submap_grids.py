@@ -186,7 +186,7 @@ def _ways(
             progress(k + 1)
     redrawn.log_odds = draw.clamped(draw.add(empty, poses, ranges))
 
-    began, own, longest = time.perf_counter(), [], 0.0
+    began, own = time.perf_counter(), []
     for k in range(trail.submaps):
         members = trail.submap == k
         own.append(draw.add(np.zeros(draw.small.shape, np.float32), trail.place[members], ranges[members]))

@@ -151,9 +151,8 @@ def close_loops(
         if len(old):
             # Of all submaps, so that one program serves.
             every = np.stack([np.arange(n), np.full(n, j)], axis=-1).astype(np.int32)
-            apart = np.asarray(relative_covariances(whole, solution, jnp.asarray(every), method=method), np.float64)[
-                old
-            ]
+            covs = relative_covariances(whole, solution, jnp.asarray(every), method=method)
+            apart = np.asarray(covs, np.float64)[old]
             means = between(poses[old], poses[j])
             for i in _nearest(scans, means, apart, j, closure):
                 spread = closure.scale**2 * (scans.spread[i] + scans.spread[j])
@@ -210,17 +209,13 @@ class _Growing:
 
 
 def _stacked(found: list[Registration]) -> Registration:
-    shapes = {"moved": (POSE,), "cov": (POSE, POSE)}
-    fields = {name: np.array([getattr(one, name) for one in found]) for name in Registration._fields}
-    return Registration(**{name: x.reshape(len(found), *shapes.get(name, ())) for name, x in fields.items()})  # type: ignore[arg-type]
+    like = Registration._make([np.zeros(POSE), np.zeros((POSE, POSE)), *np.zeros(5)])
+    return jax.tree.map(lambda one, *each: np.array(each).reshape(len(each), *np.shape(one)), like, *found)
 
 
 def _nearest(scans: SubmapScans, means: np.ndarray, covs: np.ndarray, j: int, closure: Closure) -> list[int]:
     """The submaps whose middles may lie within reach of that of submap j."""
-    cos, sin = np.cos(means[:, 2]), np.sin(means[:, 2])
-    x, y, _ = scans.middle[j]
-    away = np.stack([means[:, 0] + cos * x - sin * y, means[:, 1] + sin * x + cos * y], axis=-1)
-    distance = np.hypot(*(away - scans.middle[: len(means), :2]).T)
+    distance = np.hypot(*(compose(means, scans.middle[j]) - scans.middle[: len(means)])[:, :2].T)
     slack = 3 * np.sqrt(np.linalg.eigvalsh(covs[:, :2, :2])[:, -1])
     order = np.argsort(distance - slack)
     return [int(i) for i in order[: closure.candidates] if distance[i] - slack[i] < closure.reach]

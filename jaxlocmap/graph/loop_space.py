@@ -35,6 +35,11 @@ class System(NamedTuple):
     after: Matrix  # rxd of (L,)
     before: Matrix | None = None  # rxd of (L,); None: the negative of `after`
 
+    @property
+    def ends(self) -> tuple[tuple[int, Matrix], ...]:
+        """Column of `pair` and matrix of either end of a loop."""
+        return (1, self.after), (0, self.after.scale(-1) if self.before is None else self.before)
+
 
 class LoopSpace(NamedTuple):
     """A system, ready to be solved."""
@@ -51,7 +56,7 @@ class LoopSpace(NamedTuple):
         rows = _rows(system, self._without_loops(g))
         weight = jax.scipy.linalg.cho_solve((self.factor, True), jnp.stack(rows, axis=-1).reshape(-1))
         pulls = tuple(jnp.moveaxis(weight.reshape(-1, len(rows)), -1, 0))
-        return self._without_loops(_minus_loops(system, pulls, g))
+        return self._without_loops(minus_loops(system, pulls, g))
 
     def _without_loops(self, g: Vectors) -> Vectors:
         """V g: of odometry alone."""
@@ -75,7 +80,7 @@ class LoopSpace(NamedTuple):
             return apart
         across = []
         for end, sign in ((b, 1), (a, -1)):
-            for loop_end, J in _ends(system):
+            for loop_end, J in system.ends:
                 shared = _upper(sign * self.sums[jnp.minimum(system.pair[:, loop_end, None], end[None])], d)
                 across.append(_broadcast(J, 1) @ shared)
         rows = sum(across[1:], across[0])
@@ -99,8 +104,8 @@ def factorised(system: System) -> LoopSpace:
         S = _broadcast(system.after, 1) @ V @ _broadcast(system.after, 0).T
     else:
         S = Matrix([[0] * r] * r)
-        for i, J in _ends(system):
-            for j, K in _ends(system):
+        for i, J in system.ends:
+            for j, K in system.ends:
                 S = S + _broadcast(J, 1) @ _upper(shared[i, j], d) @ _broadcast(K, 0).T
     size = len(system.pair) * r
     table = jnp.stack([jnp.stack(row, axis=-1) for row in S.rows], axis=1).reshape(size, size)  # (L, r, L, r)
@@ -109,23 +114,18 @@ def factorised(system: System) -> LoopSpace:
     )
 
 
-def _ends(system: System) -> tuple[tuple[int, Matrix], ...]:
-    before = system.after.scale(-1) if system.before is None else system.before
-    return (1, system.after), (0, before)
-
-
 def _rows(system: System, x: Vectors) -> list[jax.Array]:
     """A x: r entries of (L,)."""
     total = Matrix([[0]] * system.after.shape[0])
-    for end, J in _ends(system):
+    for end, J in system.ends:
         total = total + J @ Matrix([[entry[system.pair[:, end]]] for entry in x])
     return [row for (row,) in total.rows]
 
 
-def _minus_loops(system: System, pulls: Vectors, g: Vectors) -> Vectors:
+def minus_loops(system: System, pulls: Vectors, g: Vectors) -> Vectors:
     """G - Aᵀ y."""
     table = jnp.stack(g, axis=-1)
-    for end, J in _ends(system):
+    for end, J in system.ends:
         pull = J.T @ Matrix([[entry] for entry in pulls])
         table = table.at[system.pair[:, end]].add(-jnp.stack([row for (row,) in pull.rows], axis=-1))
     return tuple(table[:, i] for i in range(len(g)))

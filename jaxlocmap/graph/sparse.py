@@ -95,7 +95,7 @@ def factorised(system: System, *, sparsax: bool) -> Sparse:
     upper = [(i, j) for i in range(d) for j in range(i, d)]
     like = jnp.zeros_like(system.information[0, 0])
     n = len(like) + 1
-    before = system.after.scale(-1) if system.before is None else system.before
+    (_, after), (_, before) = system.ends
 
     def stacked(M: Matrix, entries: list[tuple[int, int]], like: jax.Array) -> jax.Array:
         return jnp.stack([M[i, j] + like for i, j in entries], axis=-1)
@@ -103,11 +103,11 @@ def factorised(system: System, *, sparsax: bool) -> Sparse:
     W = stacked(system.information, upper, like)
     diagonal = jnp.zeros((n, len(upper)), W.dtype).at[1:].add(W).at[:-1].add(W)
     none = jnp.zeros(system.pair.shape[:1], W.dtype)
-    for end, J in ((0, before), (1, system.after)):
+    for end, J in system.ends:
         diagonal = diagonal.at[system.pair[:, end]].add(stacked(J.T @ J, upper, none))
     every = [(i, j) for i in range(d) for j in range(d)]
     chain = -stacked(system.information, every, like)
-    loops = stacked(before.T @ system.after, every, none)
+    loops = stacked(before.T @ after, every, none)
 
     k = jnp.arange(n, dtype=jnp.int32)
     blocks = [(diagonal, upper, k, k), (chain, every, k[:-1], k[1:]), (loops, every, *system.pair.T.astype(jnp.int32))]

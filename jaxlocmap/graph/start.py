@@ -12,7 +12,7 @@ from jaxlocmap._internal.linalg import Matrix
 from jaxlocmap._internal.trig import arctan2, sin_cos
 from jaxlocmap.graph import methods
 from jaxlocmap.graph.factors import Graph, check, dead_reckoning, root, walked
-from jaxlocmap.graph.loop_space import System
+from jaxlocmap.graph.loop_space import System, minus_loops
 from jaxlocmap.graph.prefix import prefix_sum
 from jaxlocmap.se2 import POSE, wrap
 
@@ -93,9 +93,6 @@ def _places(graph: Graph, theta: jax.Array, first: jax.Array, method: str) -> ja
 
 def _least_squares(system: System, residual: tuple[jax.Array, ...], method: str) -> tuple[jax.Array, ...]:
     """The minimum over x of the system's chain at zero and its loops at residuals, r of (L,)."""
-    before = system.after.scale(-1) if system.before is None else system.before
-    g = jnp.zeros((len(system.information[0, 0]) + 1, system.after.shape[1]), residual[0].dtype)
-    for end, J in ((1, system.after), (0, before)):
-        pull = J.T @ Matrix([[entry] for entry in residual])
-        g = g.at[system.pair[:, end]].add(-jnp.stack([row for (row,) in pull.rows], axis=-1))
-    return methods.factorised(system, method).solve(tuple(g[:, i] for i in range(g.shape[1])))
+    zero = jnp.zeros(len(system.information[0, 0]) + 1, residual[0].dtype)
+    slope = minus_loops(system, residual, (zero,) * system.after.shape[1])
+    return methods.factorised(system, method).solve(slope)

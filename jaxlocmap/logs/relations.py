@@ -85,10 +85,16 @@ def pairs(time: np.ndarray, relations: Relations) -> tuple[np.ndarray, np.ndarra
     Returns:
         (M,) each: places of the two stamps in `time`; and (K,) bool: which relations they are of.
     """
-    beyond = np.clip(np.searchsorted(time, relations.time), 1, len(time) - 1)
-    nearest = beyond - (relations.time - time[beyond - 1] < time[beyond] - relations.time)
-    there = np.all(np.abs(time[nearest] - relations.time) < _SAME_TIME, axis=1)
+    nearest, known = find_stamps(time, relations.time)
+    there = np.all(known, axis=1)
     return *nearest[there].T, there
+
+
+def find_stamps(time: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Places in `time` (T,) s, increasing, of the stamps nearest to those wanted, any shape; and which are the same."""
+    beyond = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
+    nearest = beyond - (wanted - time[beyond - 1] < time[beyond] - wanted)
+    return nearest, np.abs(time[nearest] - wanted) < _SAME_TIME
 
 
 def relation_errors(time: np.ndarray, poses: np.ndarray, relations: Relations) -> RelationErrors:

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap.graph.factors import Graph, dead_reckoning
-from jaxlocmap.se2 import POSE, wrap
+from jaxlocmap.se2 import POSE, between, wrap
 
 _STEP = 1.0  # m between two poses
 _TURN = 0.3  # rad, standard deviation of the turn between them
@@ -44,27 +44,20 @@ def simulate_graph(key: jax.Array, *, poses: int = 100, loops: int = 10, false: 
     second = first + jax.random.randint(more, (every,), _APART, poses - first)
     pair = jnp.stack([first, second], axis=-1).astype(jnp.int32)
 
-    exact = Graph(
-        steps, *(jnp.zeros((poses - 1, POSE, POSE)), pair, jnp.zeros((every, POSE)), jnp.zeros((every, POSE, POSE)))
-    )
+    def told(std: tuple[float, ...], count: int) -> jax.Array:
+        return jnp.broadcast_to(jnp.diag(jnp.asarray(std, dtype) ** -2), (count, POSE, POSE))
+
+    exact = Graph(steps, told(_ODOMETRY, poses - 1), pair, jnp.zeros((every, POSE)), told(_LOOPS, every))
     truth = dead_reckoning(exact)
     odometry = _disturbed(steps, draws[: poses - 1] * jnp.asarray(_ODOMETRY, dtype)[None])
-    loop = _disturbed(_between(truth[first], truth[second]), draws[poses - 1 :] * jnp.asarray(_LOOPS, dtype)[None])
+    moved = jax.vmap(lambda a, b: between(a, b)[0])(truth[first], truth[second])
+    loop = _disturbed(moved, draws[poses - 1 :] * jnp.asarray(_LOOPS, dtype)[None])
     reach = jnp.ptp(truth[:, :2], axis=0)
     scale = jnp.concatenate([reach, jnp.full((1,), jnp.pi, dtype)])
     anywhere = jax.random.uniform(wrong, (every, POSE), minval=-1, maxval=1) * scale[None]
     loop = jnp.where((jnp.arange(every) >= loops)[:, None], anywhere, loop)
 
-    def told(std: tuple[float, ...], count: int) -> jax.Array:
-        return jnp.broadcast_to(jnp.diag(jnp.asarray(std, dtype) ** -2), (count, POSE, POSE))
-
-    return truth, Graph(odometry, told(_ODOMETRY, poses - 1), pair, loop, told(_LOOPS, every))
-
-
-def _between(a: jax.Array, b: jax.Array) -> jax.Array:
-    sin, cos = jnp.sin(a[:, 2]), jnp.cos(a[:, 2])
-    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    return jnp.stack([cos * dx + sin * dy, cos * dy - sin * dx, wrap(b[:, 2] - a[:, 2])], axis=-1)
+    return truth, exact._replace(odometry=odometry, loop=loop)
 
 
 def _disturbed(moved: jax.Array, error: jax.Array) -> jax.Array:
