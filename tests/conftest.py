@@ -18,15 +18,15 @@ from jaxlocmap import Config, Gaussian, GridSpec, Inputs, Params
 
 X64 = os.environ.get("JAXLOCMAP_X64", "1") != "0"
 jax.config.update("jax_enable_x64", X64)
-# Compiling takes most of the time. The float32 job, and programs in processes of their own, compile as users do.
-jax.config.update("jax_disable_most_optimizations", X64)
-if X64:  # read when JAX first compiles: in one piece, without a compiler's context for every kernel
-    quickly = (
-        "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE",
-        "--xla_cpu_parallel_codegen_split_count=1",
-        "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters",
-    )
-    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *quickly]).strip()
+# Compiling takes most of the time: as little optimised as can be, in one piece, without a compiler's context for every
+# kernel. JAX reads the flags when it first compiles. Programs in processes of their own get them too (`programs`).
+jax.config.update("jax_disable_most_optimizations", True)
+QUICKLY = (
+    "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE",
+    "--xla_cpu_parallel_codegen_split_count=1",
+    "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters",
+)
+os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *QUICKLY]).strip()
 gc.set_threshold(50_000, 20, 50)  # tracing makes many small objects, which are not garbage
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -54,7 +54,7 @@ def as_a_program():
     """Not in the strict session: a program makes its own."""
     with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
         yield
-    jax.config.update("jax_disable_most_optimizations", X64)
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 class Course(NamedTuple):

@@ -111,12 +111,17 @@ class Bowl:
     def check(self, params, batch):
         pass
 
-    def __call__(self, params, batch):
-        return jnp.sum(batch.prior.mean[:, 0]) * (0.5 * jnp.log(params.R[0, 0])) ** 2, {}
+    check_batch = check_start = lambda self, *args: None
+
+    def tallies(self, params, batch):
+        return {"bowl": (batch.prior.mean[:, 0] * (0.5 * jnp.log(params.R[0, 0])) ** 2,)}, None
+
+    def value(self, sums):
+        return sums["bowl"][0], {}
 
     def judged(self, params, batch):
         self.asked.append(batch)
-        return (self.told.pop(0) if self.told else float(self(params, batch)[0])), {}
+        return (self.told.pop(0) if self.told else float(jnp.sum(self.tallies(params, batch)[0]["bowl"][0]))), {}
 
 
 def weights(*values):
@@ -155,7 +160,7 @@ FALLING = tuple(-float(i) for i in range(30))
     ],
 )
 def test_it_goes_on_while_the_loss_falls_by_its_tolerance(told, options, epochs, best):
-    found, _ = bowl(told, **options)
+    found, _ = bowl(told, validation=weights(1.0), **options)
     assert found.losses.tolist() == list(told[: epochs + 1])
     assert (found.best_epoch, found.loss) == (best, told[best])
     assert len(found.trace.loss) == 2 * epochs
@@ -184,7 +189,12 @@ def test_the_validation_set_picks_the_best():
     assert all(asked is other for asked in objective.asked)
     np.testing.assert_allclose(found.losses[0], 5 * math.log(2) ** 2, rtol=1e-5)
     np.testing.assert_allclose(found.trace.loss[0], 3 * math.log(2) ** 2, rtol=1e-5)
-    assert all(asked is batch for asked in bowl(batch=batch, epochs=1)[1].asked)
+    alone, objective = bowl(batch=batch, epochs=2)
+    assert not objective.asked  # the loss of the whole batch is known from the descent
+    np.testing.assert_allclose(alone.losses[[0, 1]], alone.trace.loss[[0, 2]], rtol=1e-7)
+    of_minibatches = bowl(batch=batch, epochs=1, minibatch=1, key=jax.random.key(0))[1]
+    assert len(of_minibatches.asked) == 2
+    assert all(asked is batch for asked in of_minibatches.asked)
 
 
 def test_a_minibatch_is_drawn_anew_without_repetition_and_moves_by_5_percent():

@@ -18,7 +18,7 @@ def test_it_is_the_quadratic_form_of_differences(x64):
     objective = tuning.Objective(ONLY_POSES, (("nis", 1.0), ("innovation_nll", 5.0)))
     batch, h = drives(scans=False), 1e-4
     whole = tuning.unconstrain(OWN)
-    sums = jax.jit(lambda x: objective.tallies(tuning.constrain(whole | dict(zip(NAMES, x, strict=True))), batch))
+    sums = jax.jit(lambda x: objective.tallies(tuning.constrain(whole | dict(zip(NAMES, x, strict=True))), batch)[0])
 
     def gradient(at, share):
         """By differences, sequence n counting 1 + share[n] times."""

@@ -1,4 +1,4 @@
-"""Descent: any optax optimiser, in one compiled scan, the best so far kept."""
+"""Descent: L-BFGS or any optax optimiser, around one compiled program of loss and gradient, the best so far kept."""
 
 from __future__ import annotations
 
@@ -13,11 +13,16 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from jaxlocmap.parameters import Params
+from jaxlocmap.parameters import Block, Params
 from jaxlocmap.tuning.batch import Batch, pick
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.losses import Objective
 from jaxlocmap.tuning.parameters import NOISE, Coordinates, constrain, correlations_of, natural, unconstrain
+
+_LBFGS = optax.scale_by_lbfgs()  # the direction alone
+_ADAM = optax.adam(0.05)
+_SEARCHES = 6  # evaluations along a line: near the minimum a search for more digits than there are takes all it may
+_ARMIJO, _WOLFE = 1e-4, 0.9  # of the slope at the start of a line
 
 
 class Trace(NamedTuple):
@@ -25,8 +30,8 @@ class Trace(NamedTuple):
 
     loss: Any  # (steps,) of the sequences it was taken on
     gradient_norm: Any  # (steps,) by the coordinates
-    skipped: Any  # (steps,) bool: something was not finite, so no step was taken
-    evaluations: Any  # (steps,) of value and gradient
+    skipped: Any  # (steps,) bool: no step was taken, as something was not finite or nothing along the line was better
+    evaluations: Any  # (steps,) of value and gradient, since the step before
     params: dict[str, Any]  # (steps,) by name, in the units of `parameters.UNITS`
 
 
@@ -39,8 +44,22 @@ class Fit(NamedTuple):
     trace: Trace
     best_epoch: int  # 0: the start
     stopped_early: bool
-    compile_s: float  # of the descent
-    run_s: float  # without compilation
+    compile_s: float  # until the loss at the start is known: compilation, if there was any, and one evaluation
+    run_s: float  # of the descent
+
+
+class Evaluation(NamedTuple):
+    """The objective at some coordinates."""
+
+    loss: Any  # ()
+    gradient: Any  # by coordinate, () each
+    sums: Any  # of `Objective.tallies`
+    accepted: Any
+
+    @property
+    def finite(self) -> bool:
+        """Whether loss and gradient are."""
+        return bool(np.isfinite([self.loss, *self.gradient.values()]).all())
 
 
 def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str, ...]) -> Callable[..., Any]:
@@ -60,23 +79,62 @@ def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str
         ValueError: nothing to tune, a name that is none of the filter's parameters, more than the losses tell
             (`Objective.check_tuned`), or parameters beyond the limits of `constrain`.
     """
+    _check_coordinates(objective, params, tuned)
+    of_coordinates = _of_coordinates(objective)
+    return lambda coordinates, batch: of_coordinates(coordinates, (params, batch))[:2]
+
+
+def _check_coordinates(objective: Objective, params: Params, tuned: tuple[str, ...]) -> None:
     objective.check_tuned(tuned)
     params.check()
     blocks = objective.blocks
-    whole = unconstrain(params, blocks)
-    inside = natural(constrain(whole, blocks), blocks)
+    inside = natural(constrain(unconstrain(params, blocks), blocks), blocks)
     for name, value in natural(params, blocks).items():
         if not np.allclose(value, inside[name], rtol=1e-3, atol=1e-3 if name in correlations_of(blocks) else 0):
             raise ValueError(
                 f"{name}: expected a value within the limits of tuning, the nearest being {float(inside[name]):.3g}, "
                 f"got {float(value):.3g}"
             )
-    fixed = {name: value for name, value in whole.items() if name not in tuned}
 
-    def at(coordinates: Coordinates, batch: Batch) -> Any:
-        return objective(constrain(fixed | coordinates, blocks, others=params), batch)
 
-    return forward(at)
+@functools.lru_cache(maxsize=16)  # one function for an objective, so that JAX traces it once for the same shapes
+def _of_coordinates(objective: Objective) -> Callable[..., Any]:
+    """`f(coordinates, (params, batch)) -> (total, {loss: ()}, tallies, accepted)`; what has no coordinate stays."""
+
+    def f(coordinates: Coordinates, data: tuple[Params, Batch]) -> Any:
+        params, batch = data
+        sums, accepted = objective.tallies(_params_at(objective.blocks, coordinates, params, batch), batch)
+        total, terms = objective.value(jax.tree.map(jnp.sum, sums))
+        let_in = None if accepted is None else accepted.astype(total.dtype)  # integers have no derivative
+        return total, terms, sums, let_in
+
+    return forward(f)
+
+
+def _params_at(blocks: tuple[Block, ...], coordinates: Coordinates, params: Params, batch: Batch) -> Params:
+    """The parameters at some coordinates, in the dtype of the batch."""
+    dtype = jnp.asarray(batch.prior.mean).dtype
+    whole = {name: jnp.asarray(value, dtype) for name, value in unconstrain(params, blocks).items()}
+    return constrain(whole | coordinates, blocks, others=params)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _evaluated(objective: Objective, coordinates: Coordinates, params: Params, batch: Batch) -> Evaluation:
+    def f(coordinates: Coordinates) -> tuple[jax.Array, Any]:
+        total, _, sums, accepted = _of_coordinates(objective)(coordinates, (params, batch))
+        return total, (sums, accepted)
+
+    (loss, (sums, accepted)), gradient = jax.value_and_grad(f, has_aux=True)(coordinates)
+    return Evaluation(loss, gradient, sums, accepted)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _named(
+    blocks: tuple[Block, ...], coordinates: Coordinates, params: Params, batch: Batch
+) -> tuple[Params, dict[str, jax.Array]]:
+    """The parameters at some coordinates, and what people call them."""
+    at = _params_at(blocks, coordinates, params, batch)
+    return at, natural(at, blocks)
 
 
 def fit(
@@ -102,10 +160,10 @@ def fit(
         params: the start; what is not tuned stays.
         batch: to tune on.
         tuned: which parameters, `parameters.names_of(objective.blocks)` being all.
-        optimiser: L-BFGS by default, which wants the whole batch at every step; with minibatches `optax.adam(0.05)`:
-            coordinates are logarithms, so that is 5 % a step.
+        optimiser: of optax. By default L-BFGS with a line search, which wants the whole batch at every step; with
+            minibatches `optax.adam(0.05)`: coordinates are logarithms, so that is 5 % a step.
         epochs: at most so many; after each the validation loss is taken and `progress` called.
-        steps: of the optimiser in an epoch, one compiled scan.
+        steps: of the optimiser in an epoch.
         minibatch: sequences a step, drawn anew without repetition; all by default.
         key: of the draws.
         validation: what the best is picked by; the batch itself by default.
@@ -114,7 +172,8 @@ def fit(
         progress: called with the fit so far.
 
     Returns:
-        `Fit`. A step whose loss or gradient is not finite is skipped and counted in its trace.
+        `Fit`. A step whose loss or gradient is not finite is skipped and counted in its trace. Value and gradient are
+        compiled once for an objective, the names tuned and the shapes of the batch, however often this is called.
 
     Raises:
         ValueError: nothing to tune or nothing to tune on, more than the losses tell (`Objective.check_tuned`), a start
@@ -127,73 +186,67 @@ def fit(
             raise ValueError(f"{name}: expected at least 1, got {number}")
     if minibatch is not None and (key is None or not 1 <= minibatch <= runs):
         raise ValueError(f"minibatch: expected a key and 1 to {runs} sequences, got key {key} and {minibatch}")
-    at = coordinates_objective(objective, params, tuned)
-    objective.check(params, batch)
-    if optimiser is None:
-        optimiser = _lbfgs() if minibatch is None else optax.adam(0.05)
-    optimiser = optax.with_extra_args_support(optimiser)
-    dtype = jnp.asarray(batch.prior.mean).dtype
+    _check_coordinates(objective, params, tuned)
+    objective.check_batch(batch)
+    began = time.perf_counter()
     blocks = objective.blocks
-    whole = {name: jnp.asarray(value, dtype) for name, value in unconstrain(params, blocks).items()}
+    dtype = jnp.asarray(batch.prior.mean).dtype
+    theta = {name: jnp.asarray(unconstrain(params, blocks)[name], dtype) for name in tuned}
+    evaluations = 0
+
+    def evaluated(theta: Coordinates, some: Batch = batch) -> Evaluation:
+        nonlocal evaluations
+        evaluations += 1
+        return jax.tree.map(np.asarray, _evaluated(objective, theta, params, some))
 
     def params_at(theta: Coordinates) -> Params:
-        return constrain(whole | theta, blocks, others=params)
+        return _named(blocks, theta, params, batch)[0]
 
-    theta = {name: whole[name] for name in tuned}
-    judge = validation if validation is not None else batch
+    known: Evaluation | None = None  # at theta, of the whole batch
+    if minibatch is None:
+        known = evaluated(theta)
+        objective.check_start(batch, known.sums, known.accepted)
+    else:
+        objective.check(params, batch)
 
-    def step(batch: Batch, carry: Any, key: Any) -> Any:
-        theta, state = carry
-        if minibatch is not None:
-            batch = pick(batch, jax.random.choice(key, runs, (minibatch,), replace=False))
+    def judged() -> float:
+        nonlocal known
+        if validation is not None or minibatch is not None:
+            return objective.judged(params_at(theta), batch if validation is None else validation)[0]
+        known = evaluated(theta) if known is None else known
+        return float(known.loss)
 
-        def value(theta: Coordinates) -> jax.Array:
-            return at(theta, batch)[0]
-
-        known, fresh = optax.tree.get(state, "value", None), jnp.ones((), bool)
-        if minibatch is None and optax.tree.get(state, "grad", None) is not None:  # of a line search, at its end
-            fresh = ~jnp.isfinite(known)
-            loss, gradient = optax.value_and_grad_from_state(value)(theta, state=state)
-        else:
-            loss, gradient = jax.value_and_grad(value)(theta)
-        norm = optax.tree.norm(gradient)
-        updates, after = optimiser.update(gradient, state, theta, value=loss, grad=gradient, value_fn=value)
-        moved = optax.apply_updates(theta, updates)
-        fine = jnp.isfinite(loss) & jnp.isfinite(norm) & jnp.isfinite(optax.tree.norm(moved))
-        kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), (moved, after), (theta, state))
-        evaluations = fresh.astype(jnp.int32) + _line_search_steps(after)
-        return kept, Trace(loss, norm, ~fine, evaluations, natural(params_at(theta), blocks))
-
-    @jax.jit
-    def epoch(carry: Any, keys: Any, batch: Batch) -> Any:
-        return jax.lax.scan(functools.partial(step, batch), carry, keys)
-
-    def judged(theta: Coordinates) -> float:
-        return objective.judged(params_at(theta), judge)[0]
-
-    keys = jax.random.split(key, (epochs, steps)) if key is not None else np.zeros((epochs, steps))
-    carry = _strong((theta, optimiser.init(theta)))
-    began = time.perf_counter()
-    best, best_loss, best_epoch = carry[0], judged(carry[0]), 0
+    best, best_loss, best_epoch = theta, judged(), 0
     if not math.isfinite(best_loss):
         raise ValueError(f"validation: expected a finite loss at the start, got {best_loss}")
-    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of different widths
-        program = epoch.lower(carry, keys[0], batch).compile()
     compiled = time.perf_counter()
-    losses, traces, stale = [best_loss], [], 0
+    rule = optimiser if optimiser is not None else _ADAM if minibatch is not None else _LBFGS
+    state, losses, traces, stale = rule.init(theta), [best_loss], [], 0
 
     def so_far() -> Fit:
-        trace = jax.tree.map(lambda *xs: np.concatenate(xs), *traces)
+        trace = jax.tree.map(lambda *xs: np.stack(xs), *traces)
         seconds = compiled - began, time.perf_counter() - compiled
         return Fit(params_at(best), best_loss, np.array(losses), trace, best_epoch, stale >= patience, *seconds)
 
-    for number in range(epochs):
-        carry, trace = program(carry, keys[number], batch)
-        traces.append(jax.tree.map(np.asarray, trace))
-        losses.append(judged(carry[0]))
+    keys = None if key is None else jax.random.split(key, (epochs, steps))
+    for epoch in range(epochs):
+        for step in range(steps):
+            some = batch if keys is None or minibatch is None else _drawn(keys[epoch, step], batch, minibatch)
+            here, there = evaluated(theta, some) if known is None else known, theta
+            if rule is _LBFGS:
+                direction, state = _direction(here.gradient, state, theta)
+                theta, known = _line_search(evaluated, theta, direction, here)
+                taken = known is not here
+            else:
+                theta, state, taken = _updated(rule, objective, theta, state, here, params, some)
+                known = None
+            values = jax.tree.map(np.asarray, _named(blocks, there, params, batch)[1])
+            traces.append(Trace(here.loss, _norm(here.gradient), not taken, evaluations, values))
+            evaluations = 0
+        losses.append(judged())
         stale = 0 if losses[-1] < best_loss - tolerance * (losses[0] - best_loss) else stale + 1
         if losses[-1] < best_loss:
-            best, best_loss, best_epoch = carry[0], losses[-1], number + 1
+            best, best_loss, best_epoch = theta, losses[-1], epoch + 1
         if progress is not None:
             progress(so_far())
         if stale >= patience:
@@ -201,18 +254,73 @@ def fit(
     return so_far()
 
 
-def _lbfgs() -> optax.GradientTransformation:
-    # Near the minimum a line search that looks for more digits than there are takes all the steps it may.
-    search = optax.scale_by_zoom_linesearch(max_linesearch_steps=6, initial_guess_strategy="one")
-    return optax.lbfgs(linesearch=search)
+@functools.partial(jax.jit, static_argnums=2)
+def _drawn(key: jax.Array, batch: Batch, size: int) -> Batch:
+    """Sequences of a batch, without repetition."""
+    return pick(batch, jax.random.choice(key, len(batch.counted), (size,), replace=False))
 
 
-def _strong(tree: Any) -> Any:
-    """Arrays of types that do not yield: else the second epoch, which gets what the first returned, compiles anew."""
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), tree)
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _updated(
+    rule: optax.GradientTransformation,
+    objective: Objective,
+    theta: Coordinates,
+    state: Any,
+    here: Evaluation,
+    params: Params,
+    batch: Batch,
+) -> tuple[Coordinates, Any, jax.Array]:
+    """One step of an optimiser, and whether it was taken: not where something is not finite."""
+
+    def value(theta: Coordinates) -> jax.Array:
+        return _of_coordinates(objective)(theta, (params, batch))[0]
+
+    extra = {"value": here.loss, "grad": here.gradient, "value_fn": value}  # for those that search along a line
+    with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of different widths
+        updates, after = optax.with_extra_args_support(rule).update(here.gradient, state, theta, **extra)
+    moved = optax.apply_updates(theta, updates)
+    fine = jnp.isfinite(here.loss) & jnp.isfinite(optax.tree.norm(here.gradient)) & jnp.isfinite(optax.tree.norm(moved))
+    kept = jax.tree.map(lambda new, old: jnp.where(fine, new, old), (moved, after), (theta, state))
+    return *kept, fine
 
 
-def _line_search_steps(state: Any) -> Any:
-    """How often a line search, if the optimiser has one, evaluated the objective."""
-    counted = optax.tree.get_all_with_path(state, "num_linesearch_steps")
-    return sum((jnp.asarray(value, jnp.int32) for _, value in counted), jnp.zeros((), jnp.int32))
+@jax.jit
+def _direction(gradient: Coordinates, state: Any, theta: Coordinates) -> tuple[Coordinates, Any]:
+    """The direction of L-BFGS, and what it remembers."""
+    with jax.numpy_dtype_promotion("standard"):
+        step, state = _LBFGS.update(gradient, state, theta)
+    return jax.tree.map(jnp.negative, step), state
+
+
+def _line_search(
+    evaluated: Callable[[Coordinates], Evaluation], theta: Coordinates, direction: Coordinates, here: Evaluation
+) -> tuple[Coordinates, Evaluation]:
+    """A point along the direction at which the loss has fallen enough (Armijo) and its slope has flattened (the weak
+    Wolfe condition), by bisection; the best on the way where none is met in `_SEARCHES` evaluations, and the start
+    where none is better. A loss that is not finite counts as one that rose.
+
+    Source: Lewis & Overton 2013, algorithm 2.6.
+    """
+    slope = _along(here.gradient, direction)
+    low, high, far, best = 0.0, math.inf, 1.0, (theta, here)
+    for _ in range(_SEARCHES):
+        there = {name: x + jnp.asarray(far, x.dtype) * direction[name] for name, x in theta.items()}
+        found = evaluated(there)
+        if found.finite and found.loss < best[1].loss:
+            best = there, found
+        if not found.finite or found.loss > here.loss + _ARMIJO * far * slope:
+            high = far
+        elif _along(found.gradient, direction) < _WOLFE * slope:
+            low = far
+        else:
+            return there, found
+        far = 2 * far if math.isinf(high) else (low + high) / 2
+    return best
+
+
+def _along(gradient: Coordinates, direction: Coordinates) -> float:
+    return sum(float(gradient[name]) * float(direction[name]) for name in gradient)
+
+
+def _norm(gradient: Coordinates) -> float:
+    return _along(gradient, gradient) ** 0.5

@@ -244,11 +244,13 @@ class Objective:
 
     def __call__(self, params: Params, batch: Batch) -> tuple[jax.Array, dict[str, jax.Array]]:
         """The weighted sum, and each loss."""
-        return self.value(jax.tree.map(jnp.sum, self.tallies(params, batch)))
+        return self.value(jax.tree.map(jnp.sum, self.tallies(params, batch)[0]))
 
-    def tallies(self, params: Params, batch: Batch) -> dict[str, tuple[jax.Array, ...]]:
-        """What every sequence adds to every loss, (N,) each."""
-        return _tallies(params, batch, self.config, self.names)[0]
+    def tallies(self, params: Params, batch: Batch) -> tuple[dict[str, tuple[jax.Array, ...]], jax.Array | None]:
+        """What every sequence adds to every loss, (N,) each; and (N,) how many of its observations the gate lets in,
+        None where no filter is run.
+        """
+        return _tallies(params, batch, self.config, self.names)
 
     def value(self, sums: dict[str, tuple[jax.Array, ...]]) -> tuple[jax.Array, dict[str, jax.Array]]:
         """What a call returns, of the tallies' sums over sequences."""
@@ -280,14 +282,22 @@ class Objective:
             )
 
     def check(self, params: Params, batch: Batch) -> None:
-        """Raise if there is nothing to tune on, or if the start cannot be judged.
+        """Raise if there is nothing to tune on (`check_batch`), or if the start cannot be judged (`check_start`).
 
         Raises:
-            ValueError: a loss whose observations, truth or scans are not there; a filter that refuses everything at
-                `params`; a loss that is not finite there, with the number of sequences at fault.
+            ValueError: as these.
+        """
+        self.check_batch(batch)
+        self.check_start(batch, *_tallied(self, params, batch))
+
+    def check_batch(self, batch: Batch) -> None:
+        """Raise if there is nothing to tune on.
+
+        Raises:
+            ValueError: fields that do not fit; a loss whose observations, truth or scans are not there.
         """
         check_batch(batch)
-        observed = np.asarray(batch.inputs.valid) & np.asarray(batch.counted)[..., None]
+        observed = _observed(batch)
         for name in self.names:
             needs = LOSSES[name].needs
             if needs == "truth" and batch.truth is None:
@@ -299,7 +309,15 @@ class Objective:
                 raise ValueError(f"batch.inputs.valid: expected an observation for the loss `{name}`, got none")
             if needs == "scans" and (batch.inputs.ranges is None or batch.beam_angles is None):
                 raise ValueError(f"batch.inputs.ranges: expected scans, which the loss `{name}` needs, got None")
-        sums, accepted = _tallied(self, params, batch)
+
+    def check_start(self, batch: Batch, sums: dict[str, tuple[jax.Array, ...]], accepted: jax.Array | None) -> None:
+        """Raise if the start cannot be judged. sums, accepted: the `tallies` there.
+
+        Raises:
+            ValueError: a filter that refuses everything; a loss that is not finite, with the number of sequences at
+                fault.
+        """
+        observed = _observed(batch)
         if accepted is not None and observed.any() and not np.any(np.asarray(accepted)):
             raise ValueError(
                 f"config.gate_probability: at the start the gate refuses all {int(observed.sum())} observations, so "
@@ -316,7 +334,12 @@ class Objective:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _tallied(objective: Objective, params: Params, batch: Batch) -> tuple[dict[str, Any], jax.Array | None]:
-    return _tallies(params, batch, objective.config, objective.names)
+    return objective.tallies(params, batch)
+
+
+def _observed(batch: Batch) -> np.ndarray:
+    """(N, T, M) bool: what counts of the observations."""
+    return np.asarray(batch.inputs.valid) & np.asarray(batch.counted)[..., None]
 
 
 def _tallies(

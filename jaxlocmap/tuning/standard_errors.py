@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -63,39 +64,48 @@ def standard_errors(objective: Objective, params: Params, batch: Batch, tuned: t
         raise ValueError(f"batch: expected at least two sequences to compare, got {n}; cut long ones into windows")
     objective.check_tuned(tuned)
     blocks = objective.blocks
-    whole = unconstrain(params, blocks)
+    derivatives = _derivatives(objective, tuned, params, batch)
+    gradient, hessian, influence, scale = (np.asarray(x, np.float64) for x in derivatives)
+    estimate = np.array([float(natural(params, blocks)[name]) for name in tuned])
+    return _judge(tuned, estimate, gradient, 0.5 * (hessian + hessian.T), influence, scale, blocks)
+
+
+@functools.partial(jax.jit, static_argnames=("objective", "tuned"))
+def _derivatives(
+    objective: Objective, tuned: tuple[str, ...], params: Params, batch: Batch
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Of the objective by the coordinates: gradient (P,), Hessian (P, P), and each sequence's influence on the gradient
+    (N, P); and of the parameters in their units by the coordinates (P, P).
+    """
+    whole = unconstrain(params, objective.blocks)
     theta = jnp.stack([whole[name] for name in tuned]).astype(jnp.asarray(batch.prior.mean).dtype)
 
     def at(theta: jax.Array) -> Params:
-        return constrain(whole | dict(zip(tuned, theta, strict=True)), blocks, others=params)
+        return constrain(whole | dict(zip(tuned, theta, strict=True)), objective.blocks, others=params)
 
-    @jax.jit
-    def derivatives(theta: jax.Array, batch: Batch) -> tuple[jax.Array, ...]:
-        def tallied(theta: jax.Array) -> tuple[jax.Array, jax.Array]:
-            each = jnp.stack(jax.tree.leaves(objective.tallies(at(theta), batch)), axis=-1)
-            return each, each
+    def tallied(theta: jax.Array) -> tuple[jax.Array, dict[str, tuple[jax.Array, ...]]]:
+        sums, _ = objective.tallies(at(theta), batch)
+        return jnp.stack(jax.tree.leaves(sums), axis=-1), sums
 
-        def first(theta: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-            slope, each = jax.jacfwd(tallied, has_aux=True)(theta)
-            return jnp.sum(slope, axis=0), (slope, each)
+    def first(theta: jax.Array) -> tuple[jax.Array, tuple[jax.Array, dict[str, tuple[jax.Array, ...]]]]:
+        slope, sums = jax.jacfwd(tallied, has_aux=True)(theta)
+        return jnp.sum(slope, axis=0), (slope, sums)
 
-        def total(sums: jax.Array) -> jax.Array:
-            form = jax.tree.structure(jax.eval_shape(objective.tallies, params, batch))
-            return objective.value(jax.tree.unflatten(form, list(sums)))[0]
+    # n: sequences, k, l: what they add up, i, j: coordinates
+    second_of_sum, (slope, tallies) = jax.jacfwd(first, has_aux=True)(theta)
+    leaves, form = jax.tree.flatten(tallies)
+    each = jnp.stack(leaves, axis=-1)
 
-        # n: sequences, k, l: what they add up, i, j: coordinates
-        second_of_sum, (slope, each) = jax.jacfwd(first, has_aux=True)(theta)
-        sums, slope_of_sum = jnp.sum(each, axis=0), jnp.sum(slope, axis=0)
-        weight, bend = jax.grad(total)(sums), jax.hessian(total)(sums)
-        hessian = jnp.einsum("k,kij->ij", weight, second_of_sum)
-        hessian = hessian + jnp.einsum("kl,ki,lj->ij", bend, slope_of_sum, slope_of_sum)
-        influence = jnp.einsum("k,nki->ni", weight, slope) + jnp.einsum("kl,nl,ki->ni", bend, each, slope_of_sum)
-        scale = jax.jacfwd(lambda x: jnp.stack([natural(at(x), blocks)[name] for name in tuned]))(theta)
-        return jnp.einsum("k,ki->i", weight, slope_of_sum), hessian, influence, scale
+    def total(sums: jax.Array) -> jax.Array:
+        return objective.value(jax.tree.unflatten(form, list(sums)))[0]
 
-    gradient, hessian, influence, scale = (np.asarray(x, np.float64) for x in derivatives(theta, batch))
-    estimate = np.array([float(natural(params, blocks)[name]) for name in tuned])
-    return _judge(tuned, estimate, gradient, 0.5 * (hessian + hessian.T), influence, scale, blocks)
+    sums, slope_of_sum = jnp.sum(each, axis=0), jnp.sum(slope, axis=0)
+    weight, bend = jax.grad(total)(sums), jax.hessian(total)(sums)
+    hessian = jnp.einsum("k,kij->ij", weight, second_of_sum)
+    hessian = hessian + jnp.einsum("kl,ki,lj->ij", bend, slope_of_sum, slope_of_sum)
+    influence = jnp.einsum("k,nki->ni", weight, slope) + jnp.einsum("kl,nl,ki->ni", bend, each, slope_of_sum)
+    scale = jax.jacfwd(lambda x: jnp.stack([natural(at(x), objective.blocks)[name] for name in tuned]))(theta)
+    return jnp.einsum("k,ki->i", weight, slope_of_sum), hessian, influence, scale
 
 
 def _judge(
