@@ -22,7 +22,6 @@ jax.config.update("jax_enable_x64", X64)
 # kernel. JAX reads the flags when it first compiles. Programs in processes of their own get them too (`programs`).
 jax.config.update("jax_disable_most_optimizations", True)
 QUICKLY = (
-    "--xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE",
     "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_backend_extra_options=xla_cpu_disable_new_fusion_emitters",
 )
@@ -34,6 +33,13 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # The same examples in every run; compiling takes longer than the default deadline.
 settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_program_outlives_its_module():
+    """Compiled programs take memory, and pieces of it: Linux lets a process have 65,530, and beyond it JAX crashes."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture

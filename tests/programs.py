@@ -9,8 +9,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 WALKS = Path(__file__).parent / "walks.py"
-# A program takes the processor even where there is a GPU, which two processes cannot share.
-ON_CPU = {**os.environ, "JAX_PLATFORMS": "cpu"}
+# A program takes the processor even where there is a GPU, which two processes cannot share; and compiles quickly, with
+# the flags of `conftest`.
+ON_CPU = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 # What a report says of the computing and not of the study.
 COMPUTING = {"devices", "processes", "resumed_runs", "wall_s", "compile_s", "run_s", "runs_per_s"}
 
@@ -37,11 +38,11 @@ def stop(*_, **__):
 
 def start(file, *arguments, **environment):
     """Start a program as from a command line."""
-    inherited = {name: value for name, value in os.environ.items() if not name.startswith(("SLURM_", "XLA_FLAGS"))}
+    inherited = {name: value for name, value in ON_CPU.items() if not name.startswith("SLURM_")}
     paths = {"PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "experiments")))}
     return subprocess.Popen(
         [sys.executable, str(file), *map(str, arguments)],
-        env={**inherited, "JAX_PLATFORMS": "cpu", **paths, **environment},
+        env={**inherited, **paths, **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

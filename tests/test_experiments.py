@@ -1,24 +1,53 @@
 """Every program runs, writes what it promises, and answers a mistake with one clear line."""
 
+import importlib
 import json
 import os
 import subprocess
 import sys
+import typing
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from programs import ON_CPU
 
 pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
+sys.path.append(str(EXPERIMENTS))
+import common
 
 
-def run(name, *arguments):
-    """The program's exit status and output; a subprocess, because a program sets up JAX before it starts."""
+def run_alone(name, *arguments):
+    """The program's exit status and output, as from a command line."""
     command = [sys.executable, str(EXPERIMENTS / f"{name}.py"), *map(str, arguments)]
     done = subprocess.run(command, env=ON_CPU, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture
+def run(capsys, monkeypatch, as_a_program):
+    """The same in this process, where JAX has started."""
+
+    def leave(status, last_words):
+        print(last_words, file=sys.stderr)
+        sys.exit(status)
+
+    monkeypatch.setattr(common, "_leave", leave)  # it ends a process that has threads, as that of the tests
+
+    def call(name, *arguments):
+        program = importlib.import_module(name)
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        status = 0
+        with jax.enable_x64(False):
+            try:
+                common.command_line(program.main, typing.get_type_hints(program.main)["config"])
+            except SystemExit as end:
+                status = end.code
+        return status, "".join(capsys.readouterr())
+
+    return call
 
 
 def report(folder):
@@ -59,7 +88,7 @@ CONSISTENCY_FIELDS = [
 
 
 def test_consistency_writes_its_report_and_figures(tmp_path):
-    status, output = run("consistency", "--quick", "--out", tmp_path)
+    status, output = run_alone("consistency", "--quick", "--out", tmp_path)
     assert status == 0, output
     written = report(tmp_path)
     assert set(CONSISTENCY_FIELDS) <= set(written)
@@ -73,7 +102,7 @@ def test_consistency_writes_its_report_and_figures(tmp_path):
     assert max(map(len, tables)) <= 100
 
 
-def test_consistency_takes_params_from_a_file_and_can_leave_out_the_map(tmp_path):
+def test_consistency_takes_params_from_a_file_and_can_leave_out_the_map(run, tmp_path):
     plant = {"Q": [[0.02**2, 0], [0, 0.051**2]], "R": [[0.08**2, 0], [0, 0.02**2]], "l_occ": 0.85, "l_free": -0.4}
     (tmp_path / "plant.json").write_text(json.dumps(plant))
     arguments = ("--quick", "--no-map", "--motion", "euler", "--params", tmp_path / "plant.json", "--out", tmp_path)
@@ -87,7 +116,7 @@ def test_consistency_takes_params_from_a_file_and_can_leave_out_the_map(tmp_path
     assert 2.5 < written["anees"] < 3.3
 
 
-def test_capstone_reproduces_the_numbers_of_the_course(tmp_path):
+def test_capstone_reproduces_the_numbers_of_the_course(run, tmp_path):
     status, output = run("capstone", "--out", tmp_path)
     assert status == 0, output
     written = report(tmp_path)
@@ -114,7 +143,7 @@ LOCALIZE_FIELDS = [
 ]
 
 
-def test_localize_judges_a_real_log(tmp_path):
+def test_localize_judges_a_real_log(run, tmp_path):
     woods = data("lost_in_the_woods", "dataset2.mat")
     status, output = run("localize", woods, "--format", "woods", "--quick", "--out", tmp_path)
     assert status == 0, output
@@ -127,7 +156,7 @@ def test_localize_judges_a_real_log(tmp_path):
         assert np.loadtxt(tmp_path / name).shape[1] == 8
 
 
-def test_localize_says_that_the_gate_is_locked_out(tmp_path):
+def test_localize_says_that_the_gate_is_locked_out(run, tmp_path):
     woods = data("lost_in_the_woods", "dataset2.mat")
     status, output = run("localize", woods, "--format", "woods", "--max-range", 1.5, "--out", tmp_path)
     assert status == 0, output
@@ -135,7 +164,7 @@ def test_localize_says_that_the_gate_is_locked_out(tmp_path):
     assert "locked out" in output
 
 
-def test_localize_needs_a_start_where_there_is_no_truth(tmp_path):
+def test_localize_needs_a_start_where_there_is_no_truth(run, tmp_path):
     folder = data("mrclam", "MRCLAM_Dataset9")
     arguments = (folder, "--format", "mrclam", "--robot", 1, "--quick", "--out", tmp_path)
     status, output = run("localize", *arguments)
@@ -147,7 +176,7 @@ def test_localize_needs_a_start_where_there_is_no_truth(tmp_path):
     assert not (tmp_path / "truth.tum").exists()
 
 
-def test_map_log_maps_a_real_building(tmp_path):
+def test_map_log_maps_a_real_building(run, tmp_path):
     from jaxlocmap.mapping.ros import FREE, OCCUPIED, load_map
 
     intel = data("carmen", "intel-corrected.log.gz")
@@ -162,7 +191,7 @@ def test_map_log_maps_a_real_building(tmp_path):
     assert is_png(tmp_path / "map.png")
 
 
-def test_a_resolution_too_fine_for_the_memory_is_refused(tmp_path):
+def test_a_resolution_too_fine_for_the_memory_is_refused(run, tmp_path):
     intel = data("carmen", "intel-corrected.log.gz")
     status, output = run("map_log", intel, "--format", "carmen", "--resolution", 0.0005, "--out", tmp_path)
     assert status == 1
@@ -187,7 +216,7 @@ def test_a_resolution_too_fine_for_the_memory_is_refused(tmp_path):
         ("map_log", ("nowhere.log", "--format", "carmen", "--resolution", "nan"), "resolution: expected metres > 0"),
     ],
 )
-def test_a_mistake_gets_one_clear_line(tmp_path, name, arguments, expected):
+def test_a_mistake_gets_one_clear_line(run, tmp_path, name, arguments, expected):
     out = () if "--out" in arguments else ("--out", tmp_path)
     status, output = run(name, *arguments, *out)
     assert status != 0

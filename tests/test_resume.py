@@ -7,7 +7,7 @@ import subprocess
 import time
 
 import pytest
-from programs import ROOT, WALKS, ended, report, result, start
+from programs import ON_CPU, ROOT, WALKS, ended, report, result, start
 
 pytestmark = pytest.mark.slow
 STUDY = ("--no-map", "--runs", 8_000, "--chunk", 8)
@@ -65,7 +65,7 @@ def test_ctrl_c_stops_at_the_next_turn_and_says_how_to_go_on(tmp_path):
     # The command itself, on all devices.
     again = shlex.split(command.replace("--devices 1", ""))
     paths = f"{ROOT}{os.pathsep}{ROOT / 'experiments'}"
-    environment = {**os.environ, "PYTHONPATH": paths, "JAX_PLATFORMS": "cpu"}
+    environment = {**ON_CPU, "PYTHONPATH": paths}
     done = subprocess.run(again, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "going on: 203 of 300 runs are done" in done.stdout
