@@ -30,7 +30,7 @@ from slam_loops import is_false, surfaces
 
 from jaxlocmap import Config, Gaussian, Matcher, Params, consistency, init, plotting, run, simulation
 from jaxlocmap.consistency import readable
-from jaxlocmap.graph import dead_reckoning, solve
+from jaxlocmap.graph import Graph, dead_reckoning, solve, stack, tune_scales
 from jaxlocmap.graph.closure import Closed, Closure, close_loops, scan_poses
 from jaxlocmap.graph.kernels import Kernel
 from jaxlocmap.graph.trail import Trail, trail_of
@@ -60,8 +60,12 @@ class SlamStudyConfig:
     """Times the usual errors of the wheels; the filter is told."""
     kernel: Literal["gnc", "quadratic", "huber", "cauchy", "geman_mcclure", "dcs"] = "gnc"
     """How loops count that do not fit the others."""
+    edge_scale: float = 1.0
+    """Standard deviations of edges between submaps and of scans in them, times this."""
     loop_scale: float = 1.0
     """Standard deviations of loops, times this."""
+    tune: bool = False
+    """Find by gradient the two scales at which the true anchors are most likely; judge them on the other world."""
     write: bool = False
     """Put the table into the README."""
     seed: int = 0
@@ -86,6 +90,7 @@ class Scores:
     false_kept: int = 0
     false_refused: int = 0
     not_converged: int = 0
+    graphs: list[tuple[Graph, np.ndarray]] = dataclasses.field(default_factory=list)  # each with its true anchors
 
 
 def main(config: SlamStudyConfig) -> dict[str, Any]:
@@ -93,7 +98,7 @@ def main(config: SlamStudyConfig) -> dict[str, Any]:
     out = output_folder(config.out)
     if config.runs < 1:
         raise ValueError(f"runs: expected at least 1, got {config.runs}")
-    for name in ("scan_noise", "odometry_noise", "loop_scale"):
+    for name in ("scan_noise", "odometry_noise", "edge_scale", "loop_scale"):
         if not 0 < getattr(config, name) < np.inf:
             raise ValueError(f"{name}: expected a finite number > 0, got {getattr(config, name)}")
     merge_kernels()
@@ -110,6 +115,8 @@ def main(config: SlamStudyConfig) -> dict[str, Any]:
                 study.score(scores, *jax.tree.map(lambda x, i=i: x[i], drives))
                 progress(k + i + 1)
     report = {"scenario": config.scenario, "runs": runs, "seed": config.seed, **_summary(scores)}
+    if config.tune:
+        report["tuned"] = _tuned(scores.graphs)
     report["wall_s"] = time.perf_counter() - began
     write_report(out, report)
     seconds = study.scenario.dt * config.match_every
@@ -162,7 +169,7 @@ class SlamDrives:
 
     def closed(self, truth: np.ndarray, ranges: np.ndarray, report: Any) -> tuple[Trail, Closed]:
         """The trail of one drive, and its loops closed, the first anchor given. In float64."""
-        trail = trail_of(report)
+        trail = trail_of(report).scaled(self._config.edge_scale)
         std, scale, _ = (jnp.asarray(self.params.block(block), jnp.float32) for block in BLOCKS)
         points = surfaces(ranges, self.scenario.beam_angles(), self._settings)
         with jax.enable_x64(True):
@@ -186,6 +193,7 @@ class SlamDrives:
             for into, one in ((scores.before, alone), (scores.after, closed)):
                 into.append(_scored(trail, one, truth))
         anchors = truth[trail.begun]
+        scores.graphs.append((closed.graph, anchors))
         scores.edges.append(_nees(between(anchors[:-1], anchors[1:]) - trail.edge, trail.edge_cov))
         self._score_loops(scores, trail, closed, truth)
         scores.not_converged += not bool(closed.solution.converged)
@@ -211,6 +219,19 @@ def without_loops(closed: Closed) -> Closed:
     """The same trail with its loops left open."""
     graph = closed.graph._replace(loop_information=0 * closed.graph.loop_information)
     return closed._replace(graph=graph, solution=solve(graph, dead_reckoning(graph, closed.solution.poses[0])))
+
+
+def _tuned(runs: list[tuple[Graph, np.ndarray]]) -> dict[str, float]:
+    """The scales at which the true anchors are most likely, times those that the graphs were made with."""
+    most = max(len(anchors) for _, anchors in runs)
+    known = np.array([np.arange(most) < len(anchors) for _, anchors in runs])
+    truth = np.zeros((len(runs), most, POSE))
+    for into, (_, anchors) in zip(truth, runs, strict=True):
+        into[: len(anchors)] = anchors
+    with jax.enable_x64(True):
+        graphs = stack([graph for graph, _ in runs])
+        scales, before, after = tune_scales(graphs, jnp.asarray(truth), jnp.asarray(known))
+    return {"edges": float(scales.odometry), "loops": float(scales.loop), "nll_before": before, "nll_after": after}
 
 
 def _scored(trail: Trail, closed: Closed, truth: np.ndarray) -> np.ndarray:
@@ -295,6 +316,12 @@ def _show(report: dict[str, Any]) -> None:
         ("false loops: refused, accepted, kept", _counts(report), "any, 0, 0"),
         ("graphs not converged", str(report["not_converged"]), "0"),
     ]
+    if "tuned" in report:
+        tuned = report["tuned"]
+        rows += [
+            ("scales at which the true anchors are most likely", f"{tuned['edges']:.3f}, {tuned['loops']:.3f}", "1, 1"),
+            ("  nats an anchor, before and after", f"{tuned['nll_before']:.3f}, {tuned['nll_after']:.3f}", ""),
+        ]
     show(f"{report['scenario']}, {report['runs']} runs, in {report['wall_s']:.0f} s", rows)
 
 

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap._internal.linalg import Matrix
+from jaxlocmap.graph import dense
 from jaxlocmap.graph.prefix import prefix_sum, suffix_sum
 
 Vectors = tuple[jax.Array, ...]  # d entries of N vectors, (N,) each
@@ -54,7 +55,7 @@ class LoopSpace(NamedTuple):
         if not len(system.pair):
             return self._without_loops(g)
         rows = _rows(system, self._without_loops(g))
-        weight = jax.scipy.linalg.cho_solve((self.factor, True), jnp.stack(rows, axis=-1).reshape(-1))
+        weight = dense.solve(self.factor, jnp.stack(rows, axis=-1).reshape(-1, 1))
         pulls = tuple(jnp.moveaxis(weight.reshape(-1, len(rows)), -1, 0))
         return self._without_loops(minus_loops(system, pulls, g))
 
@@ -86,7 +87,7 @@ class LoopSpace(NamedTuple):
         rows = sum(across[1:], across[0])
         r = rows.shape[0]
         table = jnp.stack([jnp.stack(row, axis=-1) for row in rows.rows], axis=1)  # (L, r, K, d)
-        table = jax.scipy.linalg.solve_triangular(self.factor, table.reshape(len(system.pair) * r, -1), lower=True)
+        table = dense.solve_lower(self.factor, table.reshape(len(system.pair) * r, -1))
         table = table.reshape(len(table), len(pair), d)
         return apart - jnp.einsum("lki,lkj->kij", table, table)
 
@@ -109,9 +110,7 @@ def factorised(system: System) -> LoopSpace:
                 S = S + _broadcast(J, 1) @ _upper(shared[i, j], d) @ _broadcast(K, 0).T
     size = len(system.pair) * r
     table = jnp.stack([jnp.stack(row, axis=-1) for row in S.rows], axis=1).reshape(size, size)  # (L, r, L, r)
-    return LoopSpace(
-        system, sums, jnp.linalg.cholesky(table + jnp.eye(size, dtype=table.dtype), symmetrize_input=False)
-    )
+    return LoopSpace(system, sums, dense.cholesky(table + jnp.eye(size, dtype=table.dtype)))
 
 
 def _rows(system: System, x: Vectors) -> list[jax.Array]:

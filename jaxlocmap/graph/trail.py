@@ -27,6 +27,10 @@ class Trail(NamedTuple):
         """How many there are."""
         return len(self.begun)
 
+    def scaled(self, scale: float) -> Trail:
+        """The same with standard deviations times a scale."""
+        return self._replace(edge_cov=self.edge_cov * scale**2, place_cov=self.place_cov * scale**2)
+
     @property
     def middle(self) -> np.ndarray:
         """(N,) int: the scan in the middle of each submap's own; the one at which it began, if it has none."""
