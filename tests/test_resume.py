@@ -15,9 +15,10 @@ STUDY = ("--no-map", "--runs", 8_000, "--chunk", 8)
 
 def test_a_killed_study_goes_on_to_the_report_of_an_uninterrupted_one(tmp_path):
     cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "1"}
+    optimised = {"XLA_FLAGS": "", "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}  # so many runs
 
     def consistency(*arguments):
-        return start(ROOT / "experiments" / "consistency.py", *STUDY, *arguments, **cache)
+        return start(ROOT / "experiments" / "consistency.py", *STUDY, *arguments, **cache, **optimised)
 
     status, _, err = ended(consistency("--out", tmp_path / "whole"))
     assert status == 0, err
