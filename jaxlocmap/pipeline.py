@@ -6,6 +6,7 @@ is ever compiled in.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -99,6 +100,20 @@ def step(
             landmark, when it can be looked at, so far out that the state's dtype cannot hold it to a millimetre.
         TypeError: landmark ids that are not integers, a `valid` that is not boolean.
     """
+    _check_step(params, state, inputs, landmarks, beam_angles, config)
+    return _step(params, state, inputs, landmarks, beam_angles, config=config)
+
+
+@functools.partial(jax.jit, static_argnames="config", inline=True)
+def _step(
+    params: Params,
+    state: State,
+    inputs: Inputs,
+    landmarks: jax.Array | None,
+    beam_angles: jax.Array | None,
+    *,
+    config: Config,
+) -> tuple[State, Info]:
     state, info = _recorded_turn(params, state, inputs, landmarks, beam_angles, config)
     return clamp_map(state, config=config), info
 
@@ -138,13 +153,33 @@ def run(
             step length, Q or R not positive definite, `l_occ` or `l_free` of the wrong sign.
     """
     _check_run(params, inputs)
+    if landmarks is not None and sensors.resolve(config.sensor).landmarks:
+        checks.resolved("landmarks", landmarks, state.belief.mean.dtype)
+    # Compiled once where nobody compiles it. A caller's own `collect` may hold traced values, which must not be kept.
+    whole = _run if collect is collect_info else _scanned
+    return whole(params, state, inputs, landmarks, beam_angles, aside, config=config, collect=collect)
 
+
+def _scanned(
+    params: Params,
+    state: State,
+    inputs: Inputs,
+    landmarks: jax.Array | None,
+    beam_angles: jax.Array | None,
+    aside: Any,
+    *,
+    config: Config,
+    collect: Callable[[State, Info, Any], Any],
+) -> tuple[State, Any]:
     def body(state: State, now: tuple[Inputs, Any]) -> tuple[State, Any]:
         state, info = _recorded_turn(params, state, now[0], landmarks, beam_angles, config)
         return state, collect(clamp_map(state, config=config), info, now[1])
 
     state, collected = scan(body, state, (inputs, aside))
     return clamp_map(state, config=config), collected
+
+
+_run = jax.jit(_scanned, static_argnames=("config", "collect"), inline=True)
 
 
 def map_scans(
@@ -177,8 +212,19 @@ def map_scans(
     checks.shape("poses", poses, (None, POSE))
     checks.resolved("poses", poses[:, :2], jnp.result_type(poses))
     checks.shape("ranges", ranges, (len(poses), len(beam_angles)))
+    return _mapped(params, jnp.asarray(log_odds), poses, ranges, beam_angles, config=config)
 
-    log_odds = jnp.asarray(log_odds)
+
+@functools.partial(jax.jit, static_argnames="config", inline=True)
+def _mapped(
+    params: Params,
+    log_odds: jax.Array,
+    poses: jax.Array,
+    ranges: jax.Array,
+    beam_angles: jax.Array,
+    *,
+    config: Config,
+) -> jax.Array:
     params = jax.tree.map(lambda x: jnp.asarray(x, log_odds.dtype), params)
 
     def body(log_odds: jax.Array, now: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:

@@ -348,6 +348,28 @@ def test_other_values_do_not_compile_again(short, config):
     assert len({tuple(m.tolist()) for m in means}) == 5  # and every one of them mattered
 
 
+def test_nobody_needs_jit_to_compile_once(short):
+    """`run` and `step` as they are: with other values and the same shapes, the motion model is not traced again."""
+    traced = []
+
+    def transition(state, u, dt):
+        traced.append(1)
+        return motion.EULER.transition(state, u, dt)
+
+    config = Config(motion=motion.from_transition(transition))
+    state = init(short.prior, config=config)
+    one = jax.tree.map(lambda x: x[0], short.inputs)
+    for call in (
+        lambda scale: run(scale(short.params), state, short.inputs, landmarks=short.landmarks, config=config),
+        lambda scale: step(scale(short.params), state, one, landmarks=short.landmarks, config=config),
+    ):
+        call(lambda params: params)
+        before = len(traced)
+        assert before
+        call(lambda params: params._replace(Q=2 * params.Q))
+        assert len(traced) == before
+
+
 def test_a_config_made_anew_does_not_compile_again(short):
     before = compiled._cache_size()
     localise(short, Config(dt=0.1, motion="euler"))
