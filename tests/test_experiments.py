@@ -16,7 +16,7 @@ from programs import ON_CPU
 pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 sys.path.append(str(EXPERIMENTS))
-import common
+common = importlib.import_module("common")
 
 
 def run_alone(name, *arguments):
