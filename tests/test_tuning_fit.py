@@ -103,7 +103,7 @@ class Bowl:
     blocks = BLOCKS
 
     def __init__(self, told=()):
-        self.told, self.asked = list(told), []
+        self.told, self.asked, self.traced = list(told), [], 0
 
     def check_tuned(self, tuned):
         pass
@@ -114,6 +114,7 @@ class Bowl:
     check_batch = check_start = lambda self, *args: None
 
     def tallies(self, params, batch):
+        self.traced += 1
         return {"bowl": (batch.prior.mean[:, 0] * (0.5 * jnp.log(params.R[0, 0])) ** 2,)}, None
 
     def value(self, sums):
@@ -181,6 +182,31 @@ def test_the_trace_is_of_before_each_step():
     np.testing.assert_array_equal(found.trace.evaluations, 1)
     np.testing.assert_allclose(found.losses, 3 * x[[0, 3, 6]] ** 2, rtol=1e-5)
     assert float(tuning.natural(found.params)["range"]) == pytest.approx(math.exp(x[6]), rel=1e-5)
+
+
+@pytest.mark.parametrize("optimiser", [None, optax.sgd(0.1)], ids=["lbfgs", "sgd"])
+def test_another_fit_of_the_same_shapes_compiles_nothing(optimiser):
+    objective = Bowl()
+    starts = [Params.from_std(v=1.0, w=1.0, range=r, bearing=1.0) for r in (2.0, 3.0)]
+    seen = []
+    for params, batch in zip(starts, (weights(1.0, 2.0), weights(4.0, 0.5)), strict=True):
+        found = tuning.fit(objective, params, batch, tuned=("range",), optimiser=optimiser, epochs=3)
+        assert found.loss < 0.5 * found.losses[0]
+        seen.append(objective.traced)
+    assert seen[0] == seen[1] > 0
+
+
+def test_a_line_search_ends_where_the_loss_has_fallen_and_flattened():
+    """Of 3 x² from log 2 the direction is that of the slope, at most one long: to x - 1, where the loss is below that at
+    the start; and then Newton's step, which is exact.
+    """
+    found, _ = bowl(optimiser=None, epochs=2, steps=2)
+    x = np.log(np.asarray(found.trace.params["range"], float))
+    assert x[0] == pytest.approx(math.log(2), rel=1e-5)
+    assert x[1] == pytest.approx(math.log(2) - 1, rel=1e-4)
+    np.testing.assert_allclose(x[2:], 0, atol=1e-4)
+    assert found.trace.evaluations.tolist()[:2] == [2, 1]
+    assert not found.trace.skipped[:2].any()
 
 
 def test_the_validation_set_picks_the_best():
