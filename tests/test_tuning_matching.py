@@ -143,4 +143,11 @@ def test_the_filter_tells_a_match_how_soft_its_gate_is(config, monkeypatch):
     monkeypatch.setattr(submaps, "match_scan", told)
     first = jax.tree.map(lambda x: x[0], (drives().prior, drives().inputs))
     with pytest.raises(Enough):
-        run(OWN, init(first[0], config=config), first[1], beam_angles=DRIVE.beam_angles(), config=config)
+        run(
+            OWN,
+            init(first[0], config=config),
+            first[1],
+            beam_angles=DRIVE.beam_angles(),
+            config=config,
+            collect=lambda *_: (),  # so that it is traced anew
+        )
