@@ -197,8 +197,8 @@ def test_another_fit_of_the_same_shapes_compiles_nothing(optimiser):
 
 
 def test_a_line_search_ends_where_the_loss_has_fallen_and_flattened():
-    """Of 3 x² from log 2 the direction is that of the slope, at most one long: to x - 1, where the loss is below that of
-    the start; and then Newton's step, which is exact.
+    """Of 3 x² from log 2 the direction is that of the slope, at most one long: to x - 1, where the loss is below that
+    of the start; and then Newton's step, which is exact.
     """
     found, _ = bowl(optimiser=None, epochs=2, steps=2)
     x = np.log(np.asarray(found.trace.params["range"], float))
