@@ -117,6 +117,7 @@ def main(config: SlamStudyConfig) -> dict[str, Any]:
                 progress(k + i + 1)
     report = {"scenario": config.scenario, "runs": runs, "seed": config.seed, **_summary(scores)}
     if config.tune:
+        write_report(out, report)  # what the runs say is not lost if no scales are found
         report["tuned"] = _tuned(scores.graphs)
     report["wall_s"] = time.perf_counter() - began
     write_report(out, report)

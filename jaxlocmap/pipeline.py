@@ -100,21 +100,8 @@ def step(
             landmark, when it can be looked at, so far out that the state's dtype cannot hold it to a millimetre.
         TypeError: landmark ids that are not integers, a `valid` that is not boolean.
     """
-    _check_step(params, state, inputs, landmarks, beam_angles, config)
-    return _step(params, state, inputs, landmarks, beam_angles, config=config)
-
-
-@functools.partial(jax.jit, static_argnames="config", inline=True)
-def _step(
-    params: Params,
-    state: State,
-    inputs: Inputs,
-    landmarks: jax.Array | None,
-    beam_angles: jax.Array | None,
-    *,
-    config: Config,
-) -> tuple[State, Info]:
-    state, info = _recorded_turn(params, state, inputs, landmarks, beam_angles, config)
+    _check_landmarks(state, inputs, landmarks, config)
+    state, info = _turned(params, state, inputs, landmarks, beam_angles, config)
     return clamp_map(state, config=config), info
 
 
@@ -153,8 +140,7 @@ def run(
             step length, Q or R not positive definite, `l_occ` or `l_free` of the wrong sign.
     """
     _check_run(params, inputs)
-    if landmarks is not None and sensors.resolve(config.sensor).landmarks:
-        checks.resolved("landmarks", landmarks, state.belief.mean.dtype)
+    _check_landmarks(state, inputs, landmarks, config)
     # Compiled once where nobody compiles it. A caller's own `collect` may hold traced values, which must not be kept.
     whole = _run if collect is collect_info else _scanned
     return whole(params, state, inputs, landmarks, beam_angles, aside, config=config, collect=collect)
@@ -262,6 +248,9 @@ def _recorded_turn(
     return turned.state, Info(turned.state.belief, **turned.report._asdict(), ok=turned.ok, match=turned.match)
 
 
+_turned = jax.jit(_recorded_turn, static_argnames="config", inline=True)
+
+
 def _observe_slots(
     params: Params, belief: Gaussian, inputs: Inputs, landmarks: jax.Array | None, config: Config
 ) -> Observed:
@@ -344,7 +333,6 @@ def _check_step(
             raise ValueError(f"landmarks: expected (L, 2) for the {slots} observation slots, got None")
         checks.shape("landmarks", landmarks, (None, 2))
         checks.dtype("landmarks", landmarks, np.floating)
-        checks.resolved("landmarks", landmarks, state.belief.mean.dtype)
         if not len(landmarks):
             raise ValueError(f"landmarks: expected at least one for the {slots} observation slots, got (0, 2)")
     if config.matcher is not None and state.submaps is None:
@@ -356,6 +344,13 @@ def _check_step(
         checks.dtype("beam_angles", beam_angles, np.floating)
         checks.shape("inputs.ranges", inputs.ranges, np.shape(beam_angles))
         checks.dtype("inputs.ranges", inputs.ranges, np.floating)
+
+
+def _check_landmarks(state: State, inputs: Inputs, landmarks: Any, config: Config) -> None:
+    """Raise where landmarks that can be looked at, which no traced ones can, are too far out."""
+    observed = np.shape(inputs.valid)[-1:] != (0,) and sensors.resolve(config.sensor).landmarks
+    if observed and landmarks is not None and jnp.issubdtype(jnp.result_type(landmarks), jnp.floating):
+        checks.resolved("landmarks", landmarks, state.belief.mean.dtype)
 
 
 def _check_run(params: Params, inputs: Inputs) -> None:

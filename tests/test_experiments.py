@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from programs import ON_CPU
 
+sys.path.append(str(Path(__file__).parent.parent / "experiments"))
+import common
+
 pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
-sys.path.append(str(EXPERIMENTS))
-common = importlib.import_module("common")
 
 
 def run_alone(name, *arguments):

@@ -36,7 +36,7 @@ NOISE = simulation.Noise(w=0.05, blocks={"gyro": 0.02})
 OWN = simulation.own_params(NOISE, SCENARIO)
 
 
-def study_of(model, runs=500):
+def study_of(model, runs=2000):
     config = SCENARIO.config(motion=model, gate_probability=None, grid=False)
     scene = OWN, simulation.room(), NOISE, SCENARIO.prior()
     return summarise(monte_carlo(Study(SCENARIO, config), jax.random.key(0), runs, *scene).value, config)
@@ -163,7 +163,7 @@ def test_a_filter_of_any_size_is_the_textbook(n):
 
 @pytest.mark.usefixtures("x64")
 def test_the_same_filter_unrolled_or_not(monkeypatch):
-    n = 4
+    n = 5
     params, prior, inputs, landmarks = drive_of(n)
 
     def likelihood(R):

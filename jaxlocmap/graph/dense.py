@@ -6,8 +6,6 @@ depend on each other, such as those of a gradient, can wait for each other witho
 
 from __future__ import annotations
 
-import functools
-
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
@@ -28,27 +26,22 @@ def _(primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array,
 
 
 def solve_lower(L: jax.Array, b: jax.Array, *, transposed: bool = False) -> jax.Array:
-    """X with L x = b, or Lᵀ x = b, for lower triangular L (n, n); b: (n, m)."""
-    solvers = [functools.partial(_solve_lower, L, transposed=t) for t in (transposed, not transposed)]
-
-    def times(x: jax.Array) -> jax.Array:
-        return jnp.tril(L).T @ x if transposed else jnp.tril(L) @ x
-
-    return jax.lax.custom_linear_solve(times, b, lambda _, b: solvers[0](b), transpose_solve=lambda _, b: solvers[1](b))
+    """Solve L x = b, or Lᵀ x = b, for lower triangular L (n, n); b: (n, m)."""
+    T = jnp.tril(L).T if transposed else jnp.tril(L)
+    there, back = (_backward, _forward) if transposed else (_forward, _backward)
+    return jax.lax.custom_linear_solve(
+        lambda x: T @ x, b, lambda _, b: there(L, b), transpose_solve=lambda _, b: back(L, b)
+    )
 
 
 def solve(L: jax.Array, b: jax.Array) -> jax.Array:
-    """X with L Lᵀ x = b, (n, m)."""
+    """Solve L Lᵀ x = b; b: (n, m)."""
     return solve_lower(L, solve_lower(L, b), transposed=True)
 
 
 @sequential_vmap
 def _cholesky(S: jax.Array) -> jax.Array:
     return jnp.linalg.cholesky(S, symmetrize_input=False)
-
-
-def _solve_lower(L: jax.Array, b: jax.Array, *, transposed: bool) -> jax.Array:
-    return (_backward if transposed else _forward)(L, b)
 
 
 @sequential_vmap

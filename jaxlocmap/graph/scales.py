@@ -10,10 +10,9 @@ import numpy as np
 import scipy.optimize
 
 from jaxlocmap import checks
-from jaxlocmap._internal.linalg import Matrix, ldl
-from jaxlocmap._internal.linalg import solve as solve_factored
+from jaxlocmap._internal.linalg import Matrix, ldl, mahalanobis
 from jaxlocmap.graph.covariance import marginals
-from jaxlocmap.graph.factors import Graph, components, dead_reckoning
+from jaxlocmap.graph.factors import Graph, dead_reckoning
 from jaxlocmap.graph.solver import solve
 from jaxlocmap.se2 import POSE, boxminus
 
@@ -58,15 +57,14 @@ def pose_nll(graph: Graph, truth: jax.Array, known: jax.Array) -> jax.Array:
     solution = solve(graph, dead_reckoning(graph, truth[0]), method="loop_space")
     cov = marginals(graph, solution, method="loop_space")[1:]
     error = jax.vmap(boxminus)(truth[1:], solution.poses[1:])
-    # Entry by entry: LAPACK's routines, on many small matrices at once, can wait for each other without end.
-    P = Matrix([[cov[:, i, j] for j in range(POSE)] for i in range(POSE)])
-    L, D = ldl(P)
-    e = components(error)
-    each = sum(a * b for a, b in zip(e, solve_factored(L, D, e), strict=True)) + sum(jnp.log(d) for d in D)
-    return 0.5 * jnp.sum(jnp.where(known[1:], each, 0))
+
+    def one(error: jax.Array, cov: jax.Array) -> jax.Array:
+        P = Matrix.symmetric(cov)
+        return 0.5 * (mahalanobis(P, tuple(error)) + sum(jnp.log(d) for d in ldl(P)[1]))
+
+    return jnp.sum(jnp.where(known[1:], jax.vmap(one)(error, cov), 0))
 
 
-@jax.jit
 def _mean_nll(logs: jax.Array, graphs: Graph, truth: jax.Array, known: jax.Array) -> jax.Array:
     scales = Scales(*jnp.exp(logs))
     each = jax.vmap(lambda *one: pose_nll(scaled(one[0], scales), *one[1:]))(graphs, truth, known)

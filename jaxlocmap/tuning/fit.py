@@ -187,7 +187,6 @@ def fit(
     if minibatch is not None and (key is None or not 1 <= minibatch <= runs):
         raise ValueError(f"minibatch: expected a key and 1 to {runs} sequences, got key {key} and {minibatch}")
     _check_coordinates(objective, params, tuned)
-    objective.check_batch(batch)
     began = time.perf_counter()
     blocks = objective.blocks
     dtype = jnp.asarray(batch.prior.mean).dtype
@@ -204,6 +203,7 @@ def fit(
 
     known: Evaluation | None = None  # at theta, of the whole batch
     if minibatch is None:
+        objective.check_batch(batch)
         known = evaluated(theta)
         objective.check_start(batch, known.sums, known.accepted)
     else:
