@@ -26,6 +26,12 @@ def wrong():
     return truth, graph.scaled(graphs, Scales(jnp.array(2.0), jnp.array(0.5)))
 
 
+def test_a_scale_is_of_standard_deviations():
+    (_, graphs), (_, told) = drawn(), wrong()
+    np.testing.assert_allclose(told.odometry_information, graphs.odometry_information / 4)
+    np.testing.assert_allclose(told.loop_information, graphs.loop_information * 4)
+
+
 def test_wrong_scales_are_found():
     """The poses of a graph err together: of each at least the three errors of the last one count, so that a scale is
     known to one part in sqrt(2 · 900), and four times that is 10 %.

@@ -13,6 +13,7 @@ from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
 from jax.flatten_util import ravel_pytree
 
 from jaxlocmap import Gaussian, Params, simulation, tuning
+from jaxlocmap.tuning.fit import Evaluation, _line_search
 from jaxlocmap.tuning.parameters import BLOCKS
 
 OBJECTIVE = tuning.Objective(ONLY_POSES, (("innovation_nll", 1.0),))
@@ -186,14 +187,50 @@ def test_the_trace_is_of_before_each_step():
 
 @pytest.mark.parametrize("optimiser", [None, optax.sgd(0.1)], ids=["lbfgs", "sgd"])
 def test_another_fit_of_the_same_shapes_compiles_nothing(optimiser):
-    objective = Bowl()
+    objective, compiled = Bowl(), []
+
+    def listen(event, seconds, **_):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
     starts = [Params.from_std(v=1.0, w=1.0, range=r, bearing=1.0) for r in (2.0, 3.0)]
     seen = []
     for params, batch in zip(starts, (weights(1.0, 2.0), weights(4.0, 0.5)), strict=True):
+        compiled.clear()
         found = tuning.fit(objective, params, batch, tuned=("range",), optimiser=optimiser, epochs=3)
         assert found.loss < 0.5 * found.losses[0]
-        seen.append(objective.traced)
-    assert seen[0] == seen[1] > 0
+        seen.append((objective.traced, len(compiled)))
+    (traced, first), (again, second) = seen
+    assert again == traced > 0
+    assert (first > 0, second) == (True, 0)
+
+
+@pytest.mark.parametrize(
+    ("value", "slope", "end", "evaluations"),
+    [
+        (lambda x: (x - 1) ** 2, lambda x: 2 * (x - 1), 1, 1),  # at once
+        (lambda x: (x - 32) ** 2, lambda x: 2 * (x - 32), 4, 3),  # as far as a tenth of the slope is gone
+        (lambda x: (x - 0.2) ** 2, lambda x: 2 * (x - 0.2), 0.25, 3),  # nearer, until the loss has fallen
+        (lambda x: -x, lambda x: -1.0, 32, 6),  # the best of those there are
+        (lambda x: (x - 0.2) ** 2 if x < 0.4 else math.nan, lambda x: 2 * (x - 0.2), 0.25, 3),  # back from no number
+        (lambda x: x, lambda x: -1.0, 0, 6),  # nothing is better
+    ],
+)
+def test_a_line_is_searched_for_a_lower_and_flatter_place(value, slope, end, evaluations):
+    asked = []
+
+    def evaluated(theta):
+        asked.append(float(theta["x"]))
+        return Evaluation(value(asked[-1]), {"x": slope(asked[-1])}, None, None)
+
+    start = {"x": jnp.zeros(())}
+    here = evaluated(start)
+    there, found = _line_search(evaluated, start, {"x": jnp.ones(())}, here)
+    assert float(there["x"]) == end
+    assert found.loss == value(end)
+    assert (found is here) == (end == 0)
+    assert len(asked) - 1 == evaluations
 
 
 def test_a_line_search_ends_where_the_loss_has_fallen_and_flattened():
