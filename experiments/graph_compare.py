@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import gtsam
+import gtsam  # pyright: ignore[reportMissingImports] comes with the extra `benchmark` alone
 import jax
 import jax.numpy as jnp
 import numpy as np
