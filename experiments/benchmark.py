@@ -24,10 +24,12 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 from baselines import course, cpp, peers, tables
-from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
+from evidence import replace_table
 
 import jaxlocmap
 from jaxlocmap import files, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
 from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.monte_carlo import Result, hosts, monte_carlo
 from jaxlocmap.monte_carlo.hosts import check_count, merge_kernels, use_all_cores
@@ -345,4 +347,4 @@ def _machine(devices: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command_line(main, BenchmarkConfig)
+    command_line(main)

@@ -10,9 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import CONSOLE, command_line, output_folder, saved, show, write_report
 
 from jaxlocmap import Inputs, Truth, consistency, init, plotting, run, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, saved, show, write_report
 from jaxlocmap.mapping import grid, quality
 
 
@@ -133,4 +134,4 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    command_line(main, CapstoneConfig)
+    command_line(main)

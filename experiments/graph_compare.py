@@ -19,9 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from common import command_line, output_folder, progress_bar, replace_table, saved, show, write_report
+from evidence import replace_table
 
 from jaxlocmap import graph, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import output_folder, progress_bar, saved, show, write_report
 from jaxlocmap.graph.kernels import GOOD
 from jaxlocmap.graph.sparse import has_sparsax
 from jaxlocmap.logs import read_graph
@@ -324,4 +326,4 @@ def _show(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, GraphCompareConfig)
+    command_line(main)

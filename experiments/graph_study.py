@@ -13,10 +13,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
+from evidence import replace_table
 from rich.table import Table
 
 from jaxlocmap import graph, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
 from jaxlocmap.consistency import mean_over_runs, readable
 from jaxlocmap.graph.kernels import NAMES
 from jaxlocmap.monte_carlo.hosts import merge_kernels
@@ -147,4 +149,4 @@ def _show(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, GraphStudyConfig)
+    command_line(main)

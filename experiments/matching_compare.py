@@ -11,28 +11,20 @@ import jax
 import numpy as np
 from baselines import scan_filters
 from baselines.scan_filters import ON_LINES, ON_OCCUPANCY
-from common import (
-    CONSOLE,
-    GAP,
-    command_line,
-    output_folder,
-    progress_bar,
-    replace_table,
-    saved,
-    scenario_world,
-    with_known_start,
-    write_report,
-)
+from evidence import replace_table
 
 from jaxlocmap import Gaussian, Params, consistency, plotting, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
 from jaxlocmap.consistency import readable
 from jaxlocmap.consistency.means import average
 from jaxlocmap.matching.submaps import with_defaults
 from jaxlocmap.monte_carlo import hosts, monte_carlo
 from jaxlocmap.se2 import POSE
+from jaxlocmap.simulation import MATCH_GAP, with_known_start, world_of
 from jaxlocmap.types import Config, Matcher
 
-_MATCHER = Matcher(period=5, gap=GAP)
+_MATCHER = Matcher(period=5, gap=MATCH_GAP)
 _CHUNK = 5  # runs at once: their maps are large
 
 
@@ -136,7 +128,7 @@ def main(config: MatchingConfig) -> dict[str, Any]:
 
 def _world(scenario: simulation.Scenario, runs: int, seed: int, progress: Callable[[int], None]) -> dict[str, Any]:
     """Every filter on the same runs."""
-    world, noise = scenario_world(scenario), simulation.Noise()
+    world, noise = world_of(scenario), simulation.Noise()
     world = world._replace(landmarks=world.landmarks[:0])
     params = with_defaults(simulation.own_params(noise, scenario))
     settings = scenario.config(motion=simulation.own_motion(scenario), grid=False)
@@ -194,4 +186,4 @@ def _table(report: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    command_line(main, MatchingConfig)
+    command_line(main)

@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import CONSOLE, ComputeConfig, command_line, output_folder, progress_bar, saved, start, write_report
 from rich.table import Table
 
 from jaxlocmap import Config, Gaussian, Inputs, Params, State, consistency, init, plotting, run, sensors, simulation
 from jaxlocmap._internal.batching import any_in_batch
 from jaxlocmap._internal.linalg import Matrix, ldl, solve
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.compute import ComputeConfig, start
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
 from jaxlocmap.filters import ekf
 from jaxlocmap.monte_carlo import monte_carlo
 from jaxlocmap.parameters import R
@@ -367,4 +369,4 @@ def _with_error(values: dict[str, Any], name: str, form: str) -> str:
 
 
 if __name__ == "__main__":
-    command_line(main, PrecisionConfig)
+    command_line(main)

@@ -7,12 +7,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import consistency
-import localize
-import slam
-from common import CONSOLE, command_line, output_folder, replace_table
+from evidence import replace_table
 
 from jaxlocmap import files, simulation
+from jaxlocmap.cli import localize, slam, study
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder
 from jaxlocmap.consistency import readable
 from jaxlocmap.logs import write_tum
 from jaxlocmap.monte_carlo import hosts
@@ -98,8 +98,8 @@ def _studies(config: TablesConfig, out: Path) -> str:
     rows.append("|---" * 7 + "|")
     for i, (what, arguments, settings) in enumerate(_STUDIES):
         chosen: dict[str, Any] = settings | {"params": plant if settings.get("params") else None}
-        report = consistency.main(
-            consistency.ConsistencyConfig(
+        report = study.main(
+            study.StudyConfig(
                 **chosen, runs=config.runs, map=False, seed=config.seed, quick=config.quick, out=out / f"study{i}"
             )
         )
@@ -117,8 +117,8 @@ def _matches(config: TablesConfig, out: Path) -> str:
     rows = [f"| drives | arguments | {' | '.join(heads)} |", "|---" * 8 + "|"]
     for i, (what, arguments, settings) in enumerate(_MATCHES[:1] if config.quick else _MATCHES):
         chosen: dict[str, Any] = {"exact_prior": True, **settings} | ({"steps": _QUICK_STEPS} if config.quick else {})
-        report = consistency.main(
-            consistency.ConsistencyConfig(
+        report = study.main(
+            study.StudyConfig(
                 **chosen,
                 motion="euler",
                 match=True,
@@ -233,4 +233,4 @@ def _short(verdict: str) -> str:
 
 
 if __name__ == "__main__":
-    command_line(main, TablesConfig)
+    command_line(main)

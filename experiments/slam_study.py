@@ -12,23 +12,11 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import (
-    CONSOLE,
-    GAP,
-    command_line,
-    output_folder,
-    progress_bar,
-    replace_table,
-    saved,
-    scenario_of,
-    scenario_world,
-    show,
-    with_known_start,
-    write_report,
-)
-from slam_loops import is_false, surfaces
+from evidence import replace_table
 
 from jaxlocmap import Config, Gaussian, Matcher, Params, consistency, init, plotting, run, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, show, write_report
 from jaxlocmap.consistency import readable
 from jaxlocmap.graph import Graph, dead_reckoning, solve, stack, tune_scales
 from jaxlocmap.graph.closure import Closed, Closure, close_loops, scan_poses
@@ -37,7 +25,9 @@ from jaxlocmap.graph.trail import Trail, trail_of
 from jaxlocmap.matching.submaps import BLOCKS, with_defaults
 from jaxlocmap.monte_carlo.hosts import merge_kernels
 from jaxlocmap.poses import between, wrapped
+from jaxlocmap.replay.loops import is_false, surfaces
 from jaxlocmap.se2 import POSE
+from jaxlocmap.simulation import MATCH_GAP, scenario_of, with_known_start, world_of
 
 _CHUNK = 5  # runs that are simulated at once
 
@@ -142,9 +132,9 @@ class SlamDrives:
         self._noise = usual._replace(
             v=usual.v * times, w=usual.w * times, heading=usual.heading * times, scan=config.scan_noise
         )
-        world = scenario_world(scenario)
+        world = world_of(scenario)
         self.world = world._replace(landmarks=world.landmarks[:0])
-        self._matcher = Matcher(period=config.match_every, gap=GAP)
+        self._matcher = Matcher(period=config.match_every, gap=MATCH_GAP)
         settings = self.scenario.config(motion="euler", gate_probability=0.99, grid=False)
         self._settings: Config = dataclasses.replace(settings, matcher=self._matcher)
         own = simulation.own_params(self._noise, self.scenario)
@@ -336,4 +326,4 @@ def _counts(report: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    command_line(main, SlamStudyConfig)
+    command_line(main)

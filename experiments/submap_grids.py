@@ -15,11 +15,13 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
+from evidence import replace_table
 from rich.table import Table
 from slam_study import SlamDrives, SlamStudyConfig, without_loops
 
 from jaxlocmap import Config, GridSpec, map_scans, plotting, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
 from jaxlocmap.graph.closure import scan_poses
 from jaxlocmap.graph.trail import Trail
 from jaxlocmap.mapping import grid, quality
@@ -272,4 +274,4 @@ def _show(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, SubmapGridsConfig)
+    command_line(main)

@@ -23,11 +23,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.optimize
-from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
+from evidence import replace_table
 from jax.flatten_util import ravel_pytree
-from tune_sources import GATE_TEMPERATURE, TUNING_GATE
 
 from jaxlocmap import Config, Gaussian, Inputs, Params, consistency, simulation, tuning
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
+from jaxlocmap.cli.tune_sources import GATE_TEMPERATURE, TUNING_GATE
 from jaxlocmap.consistency import readable
 from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.monte_carlo import hosts, monte_carlo
@@ -422,4 +424,4 @@ def _table_of_linear(rows: list[dict[str, Any]]) -> str:
 
 
 if __name__ == "__main__":
-    command_line(main, CompareConfig)
+    command_line(main)

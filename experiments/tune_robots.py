@@ -15,10 +15,12 @@ from typing import Any
 
 import jax
 import numpy as np
-from common import CONSOLE, command_line, output_folder, progress_bar, replace_table, saved, write_report
-from tune_sources import JUDGE_GATE, TUNING_GATE, Source, Wanted, from_robots, from_scans
+from evidence import replace_table
 
 from jaxlocmap import tuning
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
+from jaxlocmap.cli.tune_sources import JUDGE_GATE, TUNING_GATE, Source, Wanted, from_robots, from_scans
 from jaxlocmap.consistency import readable
 from jaxlocmap.monte_carlo import hosts
 
@@ -168,4 +170,4 @@ def _line(log: str, loss: str, values: dict[str, float], spread: list[float] | N
 
 
 if __name__ == "__main__":
-    command_line(main, RobotsConfig)
+    command_line(main)

@@ -13,10 +13,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from common import CONSOLE, command_line, output_folder, progress_bar, saved, write_report
 from rich.table import Table
 
 from jaxlocmap import Gaussian, Params, consistency, init, run, simulation
+from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.console import CONSOLE, output_folder, progress_bar, saved, write_report
 from jaxlocmap.consistency.scoring import Totals
 from jaxlocmap.consistency.study import pose_means, reference_study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
@@ -251,4 +252,4 @@ def _print(report: dict[str, Any]) -> None:
 
 
 if __name__ == "__main__":
-    command_line(main, VerdictsConfig)
+    command_line(main)

@@ -5,13 +5,20 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 WALKS = Path(__file__).parent / "walks.py"
+_CACHE = tempfile.TemporaryDirectory(prefix="jaxlocmap-")  # not the user's own
 # A program takes the processor even where there is a GPU, which two processes cannot share; and compiles quickly, with
 # the flags of `conftest`.
-ON_CPU = {**os.environ, "JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+ON_CPU = {
+    **os.environ,
+    "JAX_PLATFORMS": "cpu",
+    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    "JAX_COMPILATION_CACHE_DIR": _CACHE.name,
+}
 # What a report says of the computing and not of the study.
 COMPUTING = {"devices", "processes", "resumed_runs", "wall_s", "compile_s", "run_s", "runs_per_s"}
 

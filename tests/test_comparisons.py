@@ -561,7 +561,7 @@ STUDY = {
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_the_studies_of_the_readme(monkeypatch, tmp_path, quick):
-    monkeypatch.setattr(readme_tables.consistency, "main", ran := Recorder(STUDY))
+    monkeypatch.setattr(readme_tables.study, "main", ran := Recorder(STUDY))
     config = readme_tables.TablesConfig(runs=70, seed=4, quick=quick)
     rows = rows_of(readme_tables._studies(config, tmp_path))
     plant = tmp_path / "plant.json"
@@ -601,7 +601,7 @@ MATCHES = {
 
 @pytest.mark.parametrize("quick", [False, True])
 def test_the_studies_of_matching_of_the_readme(monkeypatch, tmp_path, quick):
-    monkeypatch.setattr(readme_tables.consistency, "main", ran := Recorder(MATCHES))
+    monkeypatch.setattr(readme_tables.study, "main", ran := Recorder(MATCHES))
     config = readme_tables.TablesConfig(match_runs=70, seed=4, quick=quick)
     rows = rows_of(readme_tables._matches(config, tmp_path))
     configs = [args[0] for args, _ in ran.calls]

@@ -91,15 +91,27 @@ def test_processes_with_different_settings_refuse_each_other(tmp_path):
 # --- Those who do not meet ---
 
 JOIN = """
-import sys
-from common import command_line
+from __future__ import annotations
+
+import dataclasses
+
+import tyro
+
+from jaxlocmap.cli.command import command_line
 from jaxlocmap.monte_carlo import hosts
 
-def main(config):
-    hosts.join(f"127.0.0.1:{sys.argv[1]}", 2, int(sys.argv[2]), timeout=2)
 
-sys.modules["tyro"].cli = lambda *args, **kwargs: None
-command_line(main, object)
+@dataclasses.dataclass(frozen=True)
+class Meeting:
+    port: tyro.conf.Positional[int]
+    process: tyro.conf.Positional[int]
+
+
+def main(config: Meeting):
+    hosts.join(f"127.0.0.1:{config.port}", 2, config.process, timeout=2)
+
+
+command_line(main)
 """
 
 

@@ -5,7 +5,6 @@ import json
 import os
 import subprocess
 import sys
-import typing
 from pathlib import Path
 
 import jax
@@ -13,17 +12,16 @@ import numpy as np
 import pytest
 from programs import ON_CPU
 
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import common
+from jaxlocmap.cli import command
+from jaxlocmap.cli import main as jobs
 
 pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 
 
-def run_alone(name, *arguments):
+def run_alone(*command):
     """The program's exit status and output, as from a command line."""
-    command = [sys.executable, str(EXPERIMENTS / f"{name}.py"), *map(str, arguments)]
-    done = subprocess.run(command, env=ON_CPU, capture_output=True, text=True, check=False)
+    done = subprocess.run([sys.executable, *map(str, command)], env=ON_CPU, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr
 
 
@@ -35,15 +33,16 @@ def run(capsys, monkeypatch, as_a_program):
         print(last_words, file=sys.stderr)
         sys.exit(status)
 
-    monkeypatch.setattr(common, "_leave", leave)  # it ends a process that has threads, as that of the tests
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    monkeypatch.setattr(command, "_leave", leave)  # it ends a process that has threads, as that of the tests
 
     def call(name, *arguments):
-        program = importlib.import_module(name)
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, arguments)])
+        programs, words = (jobs.JOBS, [name]) if name in jobs.JOBS else (importlib.import_module(name).main, [])
+        monkeypatch.setattr(sys, "argv", ["jaxlocmap", *words, *map(str, arguments), "--no-cache"])
         status = 0
         with jax.enable_x64(False):
             try:
-                common.command_line(program.main, typing.get_type_hints(program.main)["config"])
+                command.command_line(programs)
             except SystemExit as end:
                 status = end.code
         return status, "".join(capsys.readouterr())
@@ -66,7 +65,7 @@ def data(*parts):
     return Path(os.environ["JAXLOCMAP_DATA"]).joinpath(*parts)
 
 
-CONSISTENCY_FIELDS = [
+STUDY_FIELDS = [
     "scenario",
     "runs",
     "steps",
@@ -88,26 +87,26 @@ CONSISTENCY_FIELDS = [
 ]
 
 
-def test_consistency_writes_its_report_and_figures(tmp_path):
-    status, output = run_alone("consistency", "--quick", "--out", tmp_path)
+def test_a_study_writes_its_report_and_figures(tmp_path):
+    status, output = run_alone("-m", "jaxlocmap", "study", "--quick", "--out", tmp_path)
     assert status == 0, output
     written = report(tmp_path)
-    assert set(CONSISTENCY_FIELDS) <= set(written)
+    assert set(STUDY_FIELDS) <= set(written)
     assert {"entropy_bits", "brier"} <= set(written["map"])
     assert written["runs"] == 100
     assert len(written["nees_per_step"]) == written["steps"] == 240
     assert written["verdict"] in " ".join(output.split())
     assert is_png(tmp_path / "nees.png")
     assert is_png(tmp_path / "map.png")
-    tables = [line for line in output.splitlines() if not line.startswith("wrote")]  # that one holds a path
+    tables = [line for line in output.splitlines() if not line.startswith(("wrote", "tracing"))]  # those hold paths
     assert max(map(len, tables)) <= 100
 
 
-def test_consistency_takes_params_from_a_file_and_can_leave_out_the_map(run, tmp_path):
+def test_a_study_takes_params_from_a_file_and_can_leave_out_the_map(run, tmp_path):
     plant = {"Q": [[0.02**2, 0], [0, 0.051**2]], "R": [[0.08**2, 0], [0, 0.02**2]], "l_occ": 0.85, "l_free": -0.4}
     (tmp_path / "plant.json").write_text(json.dumps(plant))
     arguments = ("--quick", "--no-map", "--motion", "euler", "--params", tmp_path / "plant.json", "--out", tmp_path)
-    status, output = run("consistency", *arguments)
+    status, output = run("study", *arguments)
     assert status == 0, output
     written = report(tmp_path)
     np.testing.assert_allclose(written["params"]["Q"], plant["Q"], rtol=1e-6)
@@ -177,11 +176,11 @@ def test_localize_needs_a_start_where_there_is_no_truth(run, tmp_path):
     assert not (tmp_path / "truth.tum").exists()
 
 
-def test_map_log_maps_a_real_building(run, tmp_path):
+def test_a_map_is_made_of_a_real_building(run, tmp_path):
     from jaxlocmap.mapping.ros import FREE, OCCUPIED, load_map
 
     intel = data("carmen", "intel-corrected.log.gz")
-    status, output = run("map_log", intel, "--format", "carmen", "--resolution", 0.1, "--quick", "--out", tmp_path)
+    status, output = run("map", intel, "--format", "carmen", "--resolution", 0.1, "--quick", "--out", tmp_path)
     assert status == 0, output
     written = report(tmp_path)
     assert {"scans", "beams", "cells", "occupied", "free", "entropy_bits", "scans_per_s"} <= set(written)
@@ -194,7 +193,7 @@ def test_map_log_maps_a_real_building(run, tmp_path):
 
 def test_a_resolution_too_fine_for_the_memory_is_refused(run, tmp_path):
     intel = data("carmen", "intel-corrected.log.gz")
-    status, output = run("map_log", intel, "--format", "carmen", "--resolution", 0.0005, "--out", tmp_path)
+    status, output = run("map", intel, "--format", "carmen", "--resolution", 0.0005, "--out", tmp_path)
     assert status == 1
     assert "resolution: expected" in output
     assert "Traceback" not in output
@@ -203,18 +202,18 @@ def test_a_resolution_too_fine_for_the_memory_is_refused(run, tmp_path):
 @pytest.mark.parametrize(
     ("name", "arguments", "expected"),
     [
-        ("consistency", ("--scenario", "moon"), "scenario"),
-        ("consistency", ("--motion", "hover"), "motion"),
-        ("consistency", ("--gate", "1.5"), "gate: expected a probability inside (0, 1)"),
-        ("consistency", ("--runs", "0"), "runs: expected at least 1, got 0"),
-        ("consistency", ("--params", "nowhere.json"), "nowhere.json"),
-        ("consistency", ("--out", "/proc/nothing"), "out: expected a folder that can be written"),
+        ("study", ("--scenario", "moon"), "scenario"),
+        ("study", ("--motion", "hover"), "motion"),
+        ("study", ("--gate", "1.5"), "gate: expected a probability inside (0, 1)"),
+        ("study", ("--runs", "0"), "runs: expected at least 1, got 0"),
+        ("study", ("--params", "nowhere.json"), "nowhere.json"),
+        ("study", ("--out", "/proc/nothing"), "out: expected a folder that can be written"),
         ("localize", ("nowhere.mat", "--format", "woods"), "nowhere.mat"),
         ("localize", (".", "--format", "mrclam"), "robot: expected a robot's number"),
         ("localize", (".", "--format", "rosbag"), "rosbag"),
-        ("map_log", ("nowhere.log", "--format", "carmen"), "nowhere.log"),
-        ("map_log", ("nowhere.log", "--format", "carmen", "--resolution", "0"), "resolution: expected metres > 0, got"),
-        ("map_log", ("nowhere.log", "--format", "carmen", "--resolution", "nan"), "resolution: expected metres > 0"),
+        ("map", ("nowhere.log", "--format", "carmen"), "nowhere.log"),
+        ("map", ("nowhere.log", "--format", "carmen", "--resolution", "0"), "resolution: expected metres > 0, got"),
+        ("map", ("nowhere.log", "--format", "carmen", "--resolution", "nan"), "resolution: expected metres > 0"),
     ],
 )
 def test_a_mistake_gets_one_clear_line(run, tmp_path, name, arguments, expected):

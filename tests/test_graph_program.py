@@ -1,8 +1,6 @@
 """The program that optimises a pose graph: what it writes and says, and what it refuses."""
 
 import json
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -12,11 +10,9 @@ from test_graph import drawn
 from test_logs import write
 
 from jaxlocmap import graph as pose_graph
+from jaxlocmap.cli import graph
 from jaxlocmap.logs import read_graph, read_trajectory, write_g2o, write_tum
 from jaxlocmap.poses import between, compose
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import graph
 
 pytestmark = pytest.mark.usefixtures("as_a_program", "x64")
 IDS = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 11])

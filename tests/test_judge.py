@@ -3,8 +3,6 @@
 import functools
 import json
 import math
-import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +11,7 @@ import reference
 import scipy.stats
 from programs import Recorder
 
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import judge as program
-
+from jaxlocmap.cli import judge as program
 from jaxlocmap.consistency import COVERAGE_LEVELS, Innovations, judge
 from jaxlocmap.logs import pair, read_innovations, read_trajectory, write_tum
 

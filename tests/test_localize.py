@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import json
 import math
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,12 +14,10 @@ import reference
 from programs import Enough, Recorder
 
 from jaxlocmap import Config, Info, Inputs, Params
+from jaxlocmap.cli import localize
 from jaxlocmap.filters import ekf
 from jaxlocmap.logs import Log, Timeline, read_trajectory
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import common
-import localize
+from jaxlocmap.replay import landmarks as replay
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
 OFFSET = (0.2, 0.1, 0.3)
@@ -50,10 +47,10 @@ class Filtered:
     def __init__(self, monkeypatch, log):
         self.read, self.given = Recorder(log), None
         monkeypatch.setattr(localize, "read", self.read)
-        monkeypatch.setattr(localize, "filter_log", self)
+        monkeypatch.setattr(replay, "filter_log", self)
 
     def __call__(self, *given):
-        self.given = given
+        *self.given, _ = given  # and the bar
         raise Enough
 
     def by(self, folder, **options):
@@ -101,7 +98,7 @@ def test_options_of_what_is_filtered(filtered, tmp_path, monkeypatch):
     _, prior, inputs, _, _ = filtered.by(tmp_path, start=(1.0, 2.0, 3.0))
     np.testing.assert_allclose(prior.mean, [1, 2, 3], rtol=1e-12)
     assert len(inputs.dt) == 40  # from the first step on, truth or not
-    monkeypatch.setattr(localize, "_PIECE", 12)
+    monkeypatch.setattr(replay, "PIECE", 12)
     *_, inputs, _, _ = filtered.by(tmp_path, quick=True)
     assert (len(inputs.dt), inputs.valid.sum()) == (12, 3)
 
@@ -147,15 +144,14 @@ def test_the_first_step_needs_truth_to_start_from():
     known = np.array([False, True])
     timeline = Timeline(np.array([5.0, 6.0]), None, np.array([[1.0, 2, 3], [4, 5, 6]]), known, {})
     with pytest.raises(ValueError, match=r"made has no truth at its first step, 5.000 s"):
-        localize.first_pose(made_log(), timeline)
-    assert localize.first_pose(made_log(), timeline._replace(truth_valid=~known)).tolist() == [1, 2, 3]
+        replay.first_pose(made_log(), timeline)
+    assert replay.first_pose(made_log(), timeline._replace(truth_valid=~known)).tolist() == [1, 2, 3]
 
 
 def test_a_log_is_filtered_in_pieces_as_in_one(monkeypatch):
     """Of 20 steps in pieces of 8, each going on where the last one stopped, against NumPy."""
-    monkeypatch.setattr(localize, "_PIECE", 8)
+    monkeypatch.setattr(replay, "PIECE", 8)
     moved = Recorder()
-    monkeypatch.setattr(common, "progress_bar", lambda what, steps: _entered(moved, (what, steps)))
     rng = np.random.default_rng(0)
     steps, landmarks = 20, np.array([[4.0, 1.0], [1.0, 5.0]])
     inputs = Inputs(
@@ -168,7 +164,8 @@ def test_a_log_is_filtered_in_pieces_as_in_one(monkeypatch):
     with jax.enable_x64(True):
         params = Params.from_std(v=0.3, w=0.3, range=0.8, bearing=0.5)
         config = Config(dt=0.1, motion="arc", gate_probability=0.9, sensor_offset=OFFSET)
-        info = localize.filter_log(params, localize.prior_at(np.array([1.0, 0.5, 0.2])), inputs, landmarks, config)
+        prior = replay.prior_at(np.array([1.0, 0.5, 0.2]))
+        info = replay.filter_log(params, prior, inputs, landmarks, config, moved)
         Q, R = np.asarray(params.Q), np.asarray(params.R)
     prior = np.array([1.0, 0.5, 0.2]), np.diag([0.05] * 3) ** 2
     gate = ekf.gate_threshold(0.9, 2)
@@ -213,8 +210,8 @@ GIVEN = ("belief", "innovation", "S", "accepted", "row", "log_likelihood", "ok")
 def judged(monkeypatch, timeline, info, **told):
     report = {"nees_per_step": [1.0, 2.0, math.nan, 9.0, 6.0, 7.0], "verdict": "so so", "counts": {"missing": 2}}
     stub = Recorder(report | told)
-    monkeypatch.setattr(localize.consistency, "judge", stub)
-    report = localize.judge(made_log(), timeline, info, Config(gate_probability=0.8))
+    monkeypatch.setattr(replay.consistency, "judge", stub)
+    report = replay.judge_log(made_log(), timeline, info, Config(gate_probability=0.8))
     ((args, how),) = stub.calls
     return report, args, how
 
@@ -281,7 +278,7 @@ COUNTS = {"odometry_gaps": 0, "odometry_gap_seconds": 0, "duplicate_truth": 0, "
     ],
 )
 def test_what_looks_odd_in_a_log_s_time_is_said(counts, changed, said):
-    sentences = localize.time_sentences(made_log(**changed), COUNTS | counts, 1.2)
+    sentences = replay.time_doubts(made_log(**changed), COUNTS | counts, 1.2)
     assert len(sentences) == (len(said) > 0)
     for words in said:
         assert words in sentences[0]

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,11 +14,11 @@ from test_experiments import is_png
 from test_logs import flaser, refused, write
 
 from jaxlocmap import Params
+from jaxlocmap.cli import map_log, tune_sources
+from jaxlocmap.logs import read
 from jaxlocmap.mapping.ros import OCCUPIED, load_map
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import map_log
-import tune_sources
+from jaxlocmap.replay import maps
+from jaxlocmap.simulation import course_params
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
 
@@ -32,7 +31,7 @@ def no_pictures(monkeypatch):
 
 def make(folder, path, **settings):
     """The report, the cells and the grid of a map."""
-    report = map_log.main(map_log.MapLogConfig(log=path, format="carmen", out=folder / "out", **settings))
+    report = map_log.main(map_log.MapConfig(log=path, format="carmen", out=folder / "out", **settings))
     written = json.loads((folder / "out" / "report.json").read_text())
     assert written["beam_angles_from"] == report["beam_angles_from"]
     return report, *load_map(folder / "out" / "map.yaml")
@@ -225,13 +224,13 @@ def mapped(monkeypatch):
     """Made without mapping: of which log with which parameters and settings, and what is drawn of it."""
     seen, drawn = Recorder(), Recorder()
 
-    def stub(params, log, config):
+    def stub(params, log, config, progress):
         seen(params, log, config)
         log_odds = np.zeros(config.grid.shape, np.float32)
         log_odds[1, 2], log_odds[0, :3] = 3.0, -2.0
         return log_odds, 2.0, 0.5
 
-    monkeypatch.setattr(map_log, "make_map", stub)
+    monkeypatch.setattr(maps, "make_map", stub)
     monkeypatch.setattr(map_log.plotting, "map_figure", drawn)
     return seen, drawn
 
@@ -273,7 +272,7 @@ def test_the_report_is_that_of_the_map(tmp_path, mapped):
 
 def test_options_reach_the_map(tmp_path, mapped, monkeypatch):
     path = logged(tmp_path, *(([1.0, 2.0, 3.0], (k, 0, 0)) for k in range(6)))
-    monkeypatch.setattr(map_log, "_PIECE", 4)
+    monkeypatch.setattr(maps, "PIECE", 4)
     Params.from_std(v=1, w=1, range=1, bearing=1, l_occ=0.5, l_free=-0.25).save(tmp_path / "a.json")
     make(tmp_path, path)
     make(tmp_path, path, quick=True, params=tmp_path / "a.json", max_range=2.5)
@@ -291,11 +290,11 @@ def test_a_map_is_made_in_pieces_as_in_one(tmp_path, monkeypatch):
     angles = np.deg2rad(np.linspace(-60, 60, 7))
     poses = [(*rng.uniform(-1, 1, 2).round(3), 0.7 * k) for k in range(5)]
     path = logged(tmp_path, *((room(angles + pose[2], at=pose[:2]).round(3), pose) for pose in poses))
-    monkeypatch.setattr(map_log, "_PIECE", 2)
-    log, spec, config = map_log.ready(map_log.read(path, "carmen", fov=math.radians(120)), 0.25, 4.0)
+    monkeypatch.setattr(maps, "PIECE", 2)
+    log, spec, config = maps.mappable(read(path, "carmen", fov=math.radians(120)), 0.25, 4.0)
     clock = iter([10.0, 12.0, 15.0])
-    monkeypatch.setattr(map_log, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    log_odds, *took = map_log.make_map(map_log.course_params(), log, config)
+    monkeypatch.setattr(maps, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    log_odds, *took = maps.make_map(course_params(), log, config)
     assert took == [3, 2]  # seconds of mapping, of compiling
     expected = np.zeros(spec.shape)
     scan = {"origin": spec.origin, "resolution": 0.25, "l_occ": 0.85, "l_free": -0.4}
@@ -307,18 +306,18 @@ def test_a_map_is_made_in_pieces_as_in_one(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("below", "said"), [(4, True), (5, False)])
-def test_few_ranges_below_the_limit_are_doubtful(tmp_path, capsys, below, said):
+def test_few_ranges_below_the_limit_are_doubtful(tmp_path, below, said):
     """Fewer than one in twenty of those that measure anything."""
     ranges = [1.0] * below + [30.0] * (100 - below) + [math.nan] * 50
-    log = map_log.read(logged(tmp_path, (ranges, (0, 0, 0))), "carmen", fov=3.0)
-    map_log.say_doubts(log, 20.0)
-    assert (f"only {below} of 100 ranges lie below" in capsys.readouterr().out) == said
+    log = read(logged(tmp_path, (ranges, (0, 0, 0))), "carmen", fov=3.0)
+    words = " ".join(maps.scan_doubts(log, 20.0))
+    assert (f"only {below} of 100 ranges lie below" in words) == said
 
 
 def test_the_grid_holds_everything_with_a_metre_around_it(tmp_path):
     """On whole cells, rows along y."""
     path = logged(tmp_path, ([2.0, 3.0, 4.0], (10.1, 20.1, math.pi / 2)))
-    spec = map_log.extent(map_log.read(path, "carmen", fov=math.pi), 0.5)
+    spec = maps.extent(read(path, "carmen", fov=math.pi), 0.5)
     # A beam of 2 m to the right, of 3 m ahead, of 4 m to the left: x from 6.1 to 12.1, y from 20.1 to 23.1.
     assert (spec.origin, spec.shape) == ((5.0, 19.0), (11, 17))
 

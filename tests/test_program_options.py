@@ -16,14 +16,15 @@ from drives import like
 from programs import Enough, Recorder, stop
 
 from jaxlocmap import Gaussian, Params, simulation
+from jaxlocmap.cli import study as study_program
+from jaxlocmap.cli import sweep
+from jaxlocmap.cli.compute import ComputeConfig
 from jaxlocmap.consistency.study import RandomBuildings
+from jaxlocmap.consistency.sweep import SWEPT, what_the_gate_buys
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import capstone
-import common
-import consistency
 import precision
-import sweep
 import verdicts
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
@@ -108,8 +109,8 @@ CONSISTENCY = (
     ids=str,
 )
 def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
-    config = consistency.ConsistencyConfig(**options, out=tmp_path, compute=common.ComputeConfig(chunk=3))
-    (study, key, runs, params, world, noise, prior), named = handed_to_the_study(monkeypatch, consistency, config)
+    config = study_program.StudyConfig(**options, out=tmp_path, compute=ComputeConfig(chunk=3))
+    (study, key, runs, params, world, noise, prior), named = handed_to_the_study(monkeypatch, study_program, config)
     expected = {"name": "capstone", "exact": True, "motion": "arc", "runs": 2000, "gate": 0.99, "map": True, "seed": 0}
     expected |= {"steps": 1200 if study.scenario.name == "loop" else 240, "landmarks": 4, "walls": 8, "own": False}
     expected |= {"beams": 61, "period": None, "blocks": 0, "prior_std": simulation.CAPSTONE.prior_std}
@@ -145,30 +146,30 @@ def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
 def test_noise_that_is_none_is_refused(tmp_path, options):
     (name,) = options
     with pytest.raises(ValueError, match=f"^{name}: expected a finite number > 0"):
-        consistency.main(consistency.ConsistencyConfig(**options, out=tmp_path))
+        study_program.main(study_program.StudyConfig(**options, out=tmp_path))
 
 
 def test_parameters_of_consistency(monkeypatch, tmp_path, plant):
-    config = consistency.ConsistencyConfig(params=plant[0], out=tmp_path)
-    given, _ = handed_to_the_study(monkeypatch, consistency, config)
+    config = study_program.StudyConfig(params=plant[0], out=tmp_path)
+    given, _ = handed_to_the_study(monkeypatch, study_program, config)
     np.testing.assert_allclose(given[3].Q, plant[1].Q, rtol=1e-6)
 
 
 def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
     """What was summed is judged beside the reference; the picture is of this study's filter."""
     for name in ("start", "study_checkpoint", "finish", "_print"):
-        monkeypatch.setattr(consistency, name, Recorder())
+        monkeypatch.setattr(study_program, name, Recorder())
     summarise, reference_of, pictured = Recorder({"anees": 3.5}), Recorder("reference"), Recorder()
     figure = Recorder()
-    monkeypatch.setattr(consistency, "study", Recorder(RESULT))
-    monkeypatch.setattr(consistency, "summarise", summarise)
-    monkeypatch.setattr(consistency, "_reference", reference_of)
-    monkeypatch.setattr(consistency, "_picture_of_one_run", pictured)
-    monkeypatch.setattr(consistency.plotting, "study_figure", figure)
-    config = consistency.ConsistencyConfig(
+    monkeypatch.setattr(study_program, "study", Recorder(RESULT))
+    monkeypatch.setattr(study_program, "summarise", summarise)
+    monkeypatch.setattr(study_program, "_reference", reference_of)
+    monkeypatch.setattr(study_program, "_picture_of_one_run", pictured)
+    monkeypatch.setattr(study_program.plotting, "study_figure", figure)
+    config = study_program.StudyConfig(
         scenario="loop", motion="euler", runs=50, gate=0.9, params=plant[0], seed=6, start="exact", out=tmp_path
     )
-    report = consistency.main(config)
+    report = study_program.main(config)
     ((totals, settings, told), _) = summarise.calls[0]
     assert (totals, settings.gate_probability, settings.motion, told) == ("totals", 0.9, "euler", "reference")
     ((scenario, same, given, _, runs), _) = reference_of.calls[0]
@@ -190,13 +191,13 @@ def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
         "runs_per_s": 50,
     }
     np.testing.assert_allclose(written["params"]["Q"], plant[1].Q, rtol=1e-6)
-    consistency.main(dataclasses.replace(config, map=False, start="drawn"))
+    study_program.main(dataclasses.replace(config, map=False, start="drawn"))
     assert len(pictured.calls) == 1
     assert json.loads((tmp_path / "report.json").read_text())["prior"] == "drawn"
     for scenario, start in (("loop", "drawn"), ("capstone", "exact")):  # a scenario's own
-        report = consistency.main(dataclasses.replace(config, map=False, start=None, scenario=scenario))
+        report = study_program.main(dataclasses.replace(config, map=False, start=None, scenario=scenario))
         assert report["prior"] == start
-    written_by_process_0_alone(monkeypatch, consistency, config)
+    written_by_process_0_alone(monkeypatch, study_program, config)
 
 
 def written_by_process_0_alone(monkeypatch, program, config):
@@ -212,11 +213,11 @@ def written_by_process_0_alone(monkeypatch, program, config):
 @pytest.mark.parametrize(("runs", "count"), [(50, 2000), (3000, 3000), (50_000, 20_000)])
 def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
     ran = Recorder(SimpleNamespace(value="reference"))
-    monkeypatch.setattr(consistency, "monte_carlo", ran)
+    monkeypatch.setattr(study_program, "monte_carlo", ran)
     scenario = simulation.CAPSTONE
     settings = scenario.config(motion="arc", gate_probability=0.9, grid=True)
-    config = consistency.ConsistencyConfig(seed=3, gate=0.9, compute=common.ComputeConfig(devices=1))
-    assert consistency._reference(scenario, settings, config, simulation.room(), runs) == "reference"
+    config = study_program.StudyConfig(seed=3, gate=0.9, compute=ComputeConfig(devices=1))
+    assert study_program._reference(scenario, settings, config, simulation.room(), runs) == "reference"
     ((study, key, asked, params, *_), how) = ran.calls[0]
     assert asked == count
     assert not same_key(key, 3)
@@ -241,13 +242,13 @@ def test_the_reference_has_drives_of_its_own(monkeypatch, runs, count):
 def test_a_reference_is_run_where_start_or_gate_make_something_of_a_filter(
     monkeypatch, exact, gate, landmarks, match, needed
 ):
-    monkeypatch.setattr(consistency, "monte_carlo", Recorder(SimpleNamespace(value="reference")))
+    monkeypatch.setattr(study_program, "monte_carlo", Recorder(SimpleNamespace(value="reference")))
     scenario = dataclasses.replace(simulation.LOOP, exact_prior=exact)
     settings = scenario.config(gate_probability=gate)
-    config = consistency.ConsistencyConfig(gate=gate, match=match)
+    config = study_program.StudyConfig(gate=gate, match=match)
     room = simulation.room()
     world = room._replace(landmarks=room.landmarks[:landmarks])
-    assert (consistency._reference(scenario, settings, config, world, 10) is not None) == needed
+    assert (study_program._reference(scenario, settings, config, world, 10) is not None) == needed
 
 
 class Mapped(NamedTuple):
@@ -258,14 +259,14 @@ def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     scenario = dataclasses.replace(simulation.LOOP, steps=4)
     settings = scenario.config(motion="euler", gate_probability=0.9)
     drove = Recorder((SimpleNamespace(pose=np.full((4, 3), 2.0)), {"inputs": np.ones(4)}))
-    monkeypatch.setattr(consistency.simulation, "simulate", drove)
+    monkeypatch.setattr(study_program.simulation, "simulate", drove)
     ran = Recorder((Mapped(np.full((2, 2), 3.0)), np.full((4, 3), 5.0)))
-    monkeypatch.setattr(consistency, "run", lambda params, state, inputs, **how: ran(params.R[0, 0], inputs, **how))
-    monkeypatch.setattr(consistency.plotting, "map_figure", figure := Recorder())
+    monkeypatch.setattr(study_program, "run", lambda params, state, inputs, **how: ran(params.R[0, 0], inputs, **how))
+    monkeypatch.setattr(study_program.plotting, "map_figure", figure := Recorder())
     key = jax.random.key(6)
     room = simulation.room()
     noise = simulation.Noise()
-    consistency._picture_of_one_run(
+    study_program._picture_of_one_run(
         tmp_path / "a.png", key, simulation.course_params(), room, noise, scenario, settings
     )
     ((given, world, noise, start), how) = drove.calls[0]
@@ -273,22 +274,22 @@ def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     assert (noise, how) == (simulation.Noise(), {"scenario": scenario})
     np.testing.assert_allclose(start, scenario.start, rtol=1e-6)
     ((_, inputs), how) = ran.calls[0]
-    assert (set(inputs), how["config"], how["collect"]) == ({"inputs"}, settings, consistency._poses)
+    assert (set(inputs), how["config"], how["collect"]) == ({"inputs"}, settings, study_program._poses)
     assert how["beam_angles"].shape == (scenario.beams,)
     ((path, log_odds, grid, beliefs), how) = figure.calls[0]
     assert (path, grid) == (tmp_path / "a.png", settings.grid)
     assert (log_odds.tolist(), beliefs[0].tolist(), how["truth"][0].tolist()) == ([[3, 3], [3, 3]], [5] * 3, [2] * 3)
     np.testing.assert_array_equal(how["segments"], world.segments)
     belief = SimpleNamespace(pose=SimpleNamespace(mean="mean"))
-    assert consistency._poses(None, SimpleNamespace(belief=belief), None) == "mean"
+    assert study_program._poses(None, SimpleNamespace(belief=belief), None) == "mean"
 
 
 def test_what_consistency_shows(monkeypatch):
-    monkeypatch.setattr(consistency, "show", shown := Recorder())
-    monkeypatch.setattr(consistency, "print_verdicts", Recorder())
-    monkeypatch.setattr(consistency.CONSOLE, "print", said := Recorder())
-    monkeypatch.setattr(consistency, "pose_rows", lambda report: [("p", "", "")])
-    monkeypatch.setattr(consistency, "innovation_rows", lambda report: [("i", "", "")])
+    monkeypatch.setattr(study_program, "show", shown := Recorder())
+    monkeypatch.setattr(study_program, "print_verdicts", Recorder())
+    monkeypatch.setattr(study_program.CONSOLE, "print", said := Recorder())
+    monkeypatch.setattr(study_program, "pose_rows", lambda report: [("p", "", "")])
+    monkeypatch.setattr(study_program, "innovation_rows", lambda report: [("i", "", "")])
     report = {
         "observations": 5,
         "anees_median_run": 2.5,
@@ -299,7 +300,7 @@ def test_what_consistency_shows(monkeypatch):
     phase = {"from_s": 1.0, "to_s": 2.5, "anees": 4.5, "band_95": (2.75, 3.25)}
     report |= {"nees_phases": [phase], "map": {"entropy_bits": 1234.5, "brier": 0.0625, "brier_base_rate": 0.125}}
     report |= {"scenario": "loop", "motion": "arc", "runs": 50, "runs_per_s": 99.6, "compile_s": 1.25, "chunk": 8}
-    consistency._print(report | {"devices": 2, "processes": 3})
+    study_program._print(report | {"devices": 2, "processes": 3})
     (((title, rows), _),) = shown.calls
     assert title == "loop, arc motion, 50 runs"
     assert rows == [
@@ -321,7 +322,7 @@ def test_what_consistency_shows(monkeypatch):
 
 
 def swept(monkeypatch, tmp_path, **options):
-    config = sweep.SweepConfig(**options, out=tmp_path, compute=common.ComputeConfig(chunk=3))
+    config = sweep.SweepConfig(**options, out=tmp_path, compute=ComputeConfig(chunk=3))
     given, named = handed_to_the_study(monkeypatch, sweep, config)
     assert named == {name: getattr(config, name) for name in ("x", "y", "scenario", "motion", "gate", "seed")}
     assert same_key(given[1], config.seed)
@@ -373,10 +374,10 @@ def test_values_of_a_sweep(monkeypatch, tmp_path, plant):
 
 @pytest.mark.parametrize("name", ["Q", "R", "sigma_v", "sigma_w", "sigma_range", "sigma_bearing"])
 def test_scales_go_from_an_eighth_to_eight_times_the_variance(name):
-    ends = sweep.SWEPT[name].values[0], sweep.SWEPT[name].values[-1]
+    ends = SWEPT[name].values[0], SWEPT[name].values[-1]
     expected = (1 / 8, 8) if name in "QR" else (8**-0.5, 8**0.5)
     assert ends == pytest.approx(expected)
-    assert sweep.SWEPT[name].values[4] == pytest.approx(1)
+    assert SWEPT[name].values[4] == pytest.approx(1)
 
 
 @pytest.mark.parametrize("across", ["gate_probability", "outlier_rate"])
@@ -398,7 +399,7 @@ def test_the_report_of_a_sweep(monkeypatch, tmp_path, plant, across):
             "diverged_runs": 0,
         }
 
-    monkeypatch.setattr(sweep, "_judged", judged)
+    monkeypatch.setattr(sweep, "judged_cell", judged)
     config = sweep.SweepConfig(across, up, number[across], number[up], runs=10, params=plant[0], out=tmp_path, seed=4)
     report = sweep.main(config)
     assert [cell[across] for cell in report["cells"]] == [*number[across]] * shape[0]
@@ -412,7 +413,7 @@ def test_the_report_of_a_sweep(monkeypatch, tmp_path, plant, across):
     np.testing.assert_allclose(report["params"]["R"], plant[1].R, rtol=1e-6)
     ((path, shown, labels, ticks), _) = figure.calls[0]
     assert (path, shown) == (tmp_path / "sweep.png", report)
-    assert labels == (sweep.SWEPT[across].meaning, sweep.SWEPT[up].meaning)
+    assert labels == (SWEPT[across].meaning, SWEPT[up].meaning)
     assert tuple(map(len, ticks)) == shape[::-1]
     written_by_process_0_alone(monkeypatch, sweep, config)
 
@@ -437,7 +438,7 @@ def test_what_a_sweep_shows(monkeypatch, across):
         for gate, anees in ((0.9, 3.0), (1.0, 7.0))
     ]
     report = {"x": across, "y": up, "x_values": values[across], "y_values": values[up], "cells": cells}
-    report |= {"what_the_gate_buys": sweep.what_the_gate_buys("outlier_rate", cells), "gate_verdict": "it buys"}
+    report |= {"what_the_gate_buys": what_the_gate_buys("outlier_rate", cells), "gate_verdict": "it buys"}
     sweep._print(report | {"verdict": "so", "runs_per_s": 99.6, "compile_s": 1.25})
     grid, gate, *said = shown_tables(printed)
     assert grid == ([["0.25", "3*", "7"]] if across == "gate_probability" else [["0.9", "3*"], ["1", "7"]])

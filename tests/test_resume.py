@@ -9,6 +9,8 @@ import time
 import pytest
 from programs import ON_CPU, ROOT, WALKS, ended, report, result, start
 
+from jaxlocmap.cli import compute
+
 pytestmark = pytest.mark.slow
 STUDY = ("--no-map", "--runs", 8_000, "--chunk", 8)
 
@@ -18,7 +20,7 @@ def test_a_killed_study_goes_on_to_the_report_of_an_uninterrupted_one(tmp_path):
     optimised = {"XLA_FLAGS": "", "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}  # so many runs
 
     def consistency(*arguments):
-        return start(ROOT / "experiments" / "consistency.py", *STUDY, *arguments, **cache, **optimised)
+        return start("-m", "jaxlocmap", "study", *STUDY, *arguments, **cache, **optimised)
 
     status, _, err = ended(consistency("--out", tmp_path / "whole"))
     assert status == 0, err
@@ -65,8 +67,7 @@ def test_ctrl_c_stops_at_the_next_turn_and_says_how_to_go_on(tmp_path):
     assert err.startswith(belongs)
     # The command itself, on all devices.
     again = shlex.split(command.replace("--devices 1", ""))
-    paths = f"{ROOT}{os.pathsep}{ROOT / 'experiments'}"
-    environment = {**ON_CPU, "PYTHONPATH": paths}
+    environment = {**ON_CPU, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(again, env=environment, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     assert "going on: 203 of 300 runs are done" in done.stdout
@@ -86,13 +87,10 @@ def test_a_new_start_loses_nothing_unless_told_to(tmp_path):
     assert report(tmp_path)["resumed_runs"] == 0
 
 
-def test_a_second_ctrl_c_stops_at_once(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "experiments")
-    import common
-
+def test_a_second_ctrl_c_stops_at_once():
     before, done = signal.default_int_handler, []
     at_first = signal.signal(signal.SIGINT, before)  # a job in the background ignores it
-    with common._stopped_by_ctrl_c(done.append) as progress:
+    with compute._stopped_by_ctrl_c(done.append) as progress:
         progress(1)
         signal.raise_signal(signal.SIGINT)
         with pytest.raises(KeyboardInterrupt):

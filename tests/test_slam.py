@@ -3,8 +3,6 @@
 import functools
 import json
 import math
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -15,13 +13,14 @@ from test_experiments import is_png
 from test_logs import write
 
 from jaxlocmap import Gaussian, Params, simulation
-from jaxlocmap.logs import Trajectory, read_graph, read_trajectory, write_tum
+from jaxlocmap.cli import slam, slam_loops
+from jaxlocmap.logs import Trajectory, read, read_graph, read_trajectory, write_tum
 from jaxlocmap.mapping.ros import load_map
 from jaxlocmap.matching.storage import load_lines
+from jaxlocmap.matching.submaps import with_defaults
 from jaxlocmap.poses import between as moved
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import slam
+from jaxlocmap.replay import loops as replay_loops
+from jaxlocmap.replay import scans
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
 SCANS = 60
@@ -97,7 +96,7 @@ def test_the_pose_on_the_map_is_where_the_scan_was_drawn():
     """Of a robot at (2, 1), on a map whose anchor is at (1, 1), turned left, and which errs by (0.1, 0.2, 0.05)."""
     mean = jnp.array([[2, 1, math.pi, 1, 1, math.pi / 2, 0.1, 0.2, 0.05, *np.zeros(6)]])
     info = SimpleNamespace(belief=Gaussian(mean, jnp.diag(jnp.arange(15.0))[None]))
-    poses, cov = slam.on_the_map(info)
+    poses, cov = scans.on_the_map(info)
     np.testing.assert_allclose(poses, [[1.8, 1.1, 0.05 - math.pi]], atol=1e-6)  # (0, -1) there is (1, 0) here
     np.testing.assert_array_equal(cov, [np.diag([0, 1, 2])])
 
@@ -162,8 +161,8 @@ def test_wheels_that_jump_are_found_out(tmp_path):
 def test_scans_are_sorted_and_one_is_kept_of_a_stamp(tmp_path):
     log_file(tmp_path)
     rows = (tmp_path / "a.log").read_text().splitlines(keepends=True)
-    log = slam.read(write(tmp_path / "b.log", "".join([rows[2], rows[0], rows[0], rows[1]])), "carmen")
-    ordered, repeated = slam.in_order(log)
+    log = read(write(tmp_path / "b.log", "".join([rows[2], rows[0], rows[0], rows[1]])), "carmen")
+    ordered, repeated = scans.in_order(log)
     assert repeated == 1
     np.testing.assert_array_equal(ordered.scan_time, [10, 11, 12])
     np.testing.assert_array_equal(ordered.scan_line, [2, 4, 1])
@@ -203,12 +202,12 @@ def test_parameters_of_a_file_take_the_place_of_the_odometry(tmp_path, monkeypat
     class Enough(Exception):
         pass
 
-    def stop(params, log, settings, start, known):
+    def stop(params, log, settings, start, known, progress):
         seen.update(params=params, scans=len(log.scan), settings=settings)
         raise Enough
 
-    monkeypatch.setattr(slam, "match_log", stop)
-    other = slam.submaps.with_defaults(Params.from_std(odometry=(0.5, 0.6, 0.7)), std=0.05)
+    monkeypatch.setattr(scans, "match_log", stop)
+    other = with_defaults(Params.from_std(odometry=(0.5, 0.6, 0.7)), std=0.05)
     other.save(tmp_path / "a.json")
     with pytest.raises(Enough):
         program(tmp_path / "out", log_file(tmp_path), params=tmp_path / "a.json", laser_offset=(0.1, 0.0, 0.2))
@@ -262,31 +261,31 @@ def test_what_closed_loops_write(made_closed):
 
 def test_words_on_loops():
     said = {"accepted": 10, "kept": 10, "converged": True}
-    assert slam.loop_doubts({}) == []
-    assert slam.loop_doubts({"closure": said}) == []
-    assert "no loop was closed" in slam.loop_doubts({"closure": said | {"accepted": 0, "kept": 0}})[0]
-    assert "3 of 10 loops do not fit" in slam.loop_doubts({"closure": said | {"kept": 7}})[0]
-    assert "did not converge" in slam.loop_doubts({"closure": said | {"converged": False}})[0]
+    assert slam_loops.loop_doubts({}) == []
+    assert slam_loops.loop_doubts({"closure": said}) == []
+    assert "no loop was closed" in slam_loops.loop_doubts({"closure": said | {"accepted": 0, "kept": 0}})[0]
+    assert "3 of 10 loops do not fit" in slam_loops.loop_doubts({"closure": said | {"kept": 7}})[0]
+    assert "did not converge" in slam_loops.loop_doubts({"closure": said | {"converged": False}})[0]
 
 
 def test_false_loops_are_counted(made_closed, monkeypatch):
     """Against the true poses none is false; against poses of which every other half is a metre aside, some are."""
     folder, _ = made_closed
     loops = []
-    kept = slam.closed
-    monkeypatch.setattr(slam, "closed", lambda *args: loops.append(kept(*args)) or loops[-1])
+    kept = replay_loops.closed
+    monkeypatch.setattr(replay_loops, "closed", lambda *args, **how: loops.append(kept(*args, **how)) or loops[-1])
     write_tum(folder / "truth.tum", 10.0 + np.arange(SCANS), drive()[0])
     report = program(
         folder / "again", folder / "a.log", closure=True, submap_length=2.5, reference=folder / "truth.tum"
     )
     assert report["closure"]["false_kept"] == 0
     aside = drive()[0] + np.where(np.arange(SCANS) > SCANS / 2, 1.0, 0.0)[:, None] * [1, 0, 0]
-    assert slam.false_loops(loops[0], aside) >= 1
-    assert slam.false_loops(loops[0], np.full((SCANS, 3), np.nan)) == 0
+    assert replay_loops.false_loops(loops[0], aside) >= 1
+    assert replay_loops.false_loops(loops[0], np.full((SCANS, 3), np.nan)) == 0
 
 
 def test_poses_at_the_stamps_of_scans():
     reference = Trajectory(np.array([1.0, 2.0, 3.0]), np.arange(9.0).reshape(3, 3), None, {})
-    found = slam.at_stamps(reference, np.array([0.5, 1.0, 2.00005, 2.6, 3.0, 9.0]))
+    found = scans.at_stamps(reference, np.array([0.5, 1.0, 2.00005, 2.6, 3.0, 9.0]))
     np.testing.assert_array_equal(np.isnan(found[:, 0]), [True, False, False, True, False, True])
     np.testing.assert_array_equal(found[[1, 2, 4]], reference.pose)

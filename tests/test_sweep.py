@@ -4,8 +4,6 @@ import dataclasses
 import itertools
 import json
 import math
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,11 +12,10 @@ import pytest
 from drives import like
 
 from jaxlocmap import Params, plotting, simulation
+from jaxlocmap.cli import sweep as command
+from jaxlocmap.consistency import sweep
 from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.monte_carlo import monte_carlo
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import sweep
 
 # In sight of all four landmarks, which the detector looks for in every second step; it can be lied to.
 SHORT = like(simulation.CAPSTONE, name="short", start=(6.0, 8.5, 0.5), steps=12, detector=dict(period=2, outliers=True))
@@ -118,10 +115,10 @@ def program(grid, tmp_path_factory):
     reports = []
     for rates, gates in (((0.0, 0.2, 0.8), (0.5, 1.0)), (RATES, GATES)):
         out = tmp_path_factory.mktemp("sweep")
-        config = sweep.SweepConfig(
+        config = command.SweepConfig(
             "outlier_rate", "gate_probability", rates, gates, scenario="short", runs=RUNS, out=out
         )
-        reports.append((sweep.main(config), out))
+        reports.append((command.main(config), out))
     patch.undo()
     return reports
 
@@ -216,14 +213,14 @@ def test_a_cell_is_judged_by_both_statistics_and_the_runs_lost(grid):
     totals = jax.tree.map(lambda total: total[1, 0], grid)
     totals = with_nees(totals, 3.0)._replace(run_nis=np.array([2.0, 4.0]) * RUNS)
     totals = totals._replace(diverged=np.array(0.0))
-    cell = sweep._judged(totals, settings())
+    cell = sweep.judged_cell(totals, settings())
     assert cell["misfit"] == pytest.approx(0, abs=1e-12)
     assert cell["consistent"]
-    lost = sweep._judged(totals._replace(diverged=np.array(1.0)), settings())
+    lost = sweep.judged_cell(totals._replace(diverged=np.array(1.0)), settings())
     assert not lost["consistent"]
     totals = with_nees(totals, 6.0)._replace(run_nis=np.array([1.0, 1.0]) * RUNS)
-    assert sweep._judged(totals, settings())["misfit"] == pytest.approx(2 * math.log(2))
-    broken = sweep._judged(totals._replace(scored_runs=np.array(0.0)), settings())
+    assert sweep.judged_cell(totals, settings())["misfit"] == pytest.approx(2 * math.log(2))
+    broken = sweep.judged_cell(totals._replace(scored_runs=np.array(0.0)), settings())
     assert broken["misfit"] == math.inf
     assert not broken["consistent"]
 
@@ -302,4 +299,4 @@ def test_a_picture_is_made_of_any_cells(tmp_path, shape, anees):
 )
 def test_nonsense_is_refused(tmp_path, arguments, expected):
     with pytest.raises(ValueError, match="^" + expected):
-        sweep.main(sweep.SweepConfig(**arguments, out=tmp_path))
+        command.main(command.SweepConfig(**arguments, out=tmp_path))

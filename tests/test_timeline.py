@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import os
-import sys
 from pathlib import Path
 
 import jax
@@ -13,6 +12,7 @@ import pytest
 
 from jaxlocmap import Config, Gaussian, Params, init, logs, run
 from jaxlocmap.logs import timeline
+from jaxlocmap.replay.landmarks import first_pose
 
 
 def log_of(odometry, observations=(), truth=(), scans=()):
@@ -190,9 +190,9 @@ def test_a_table_that_is_well_used_keeps_a_step_for_every_stamp(seen):
     assert np.all(np.diff(timeline.time) > 0)
 
 
-def test_a_log_that_starts_in_a_crowd_starts_at_its_truth(programs):
+def test_a_log_that_starts_in_a_crowd_starts_at_its_truth():
     timeline = logs.to_timeline(crowd([4000, *[0] * 2000]))
-    np.testing.assert_array_equal(programs.first_pose(crowd([1]), timeline), np.zeros(3))
+    np.testing.assert_array_equal(first_pose(crowd([1]), timeline), np.zeros(3))
 
 
 def test_what_lies_before_is_told_from_what_lies_after_and_a_stamp_at_the_limit_is_neither():
@@ -223,8 +223,7 @@ def test_stamps_that_go_back_count_in_every_stream():
 
 @pytest.fixture(scope="module")
 def programs():
-    sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-    import localize
+    from jaxlocmap.cli import localize
 
     return localize
 

@@ -5,7 +5,6 @@ import math
 import os
 import re
 import signal
-import sys
 import threading
 import time
 from pathlib import Path
@@ -15,10 +14,8 @@ import pytest
 from test_experiments import is_png
 
 from jaxlocmap import Config, Params, simulation, tuning
+from jaxlocmap.cli import tune
 from jaxlocmap.tuning.fit import Trace
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import tune
 
 WOODS = {"log": Path("nowhere"), "format": "woods"}
 MRCLAM = {"log": Path("nowhere"), "format": "mrclam"}

@@ -1,8 +1,7 @@
-"""tune.py --match: the drives it tunes on, the worlds it judges by, and what it says of them."""
+"""`tune --match`: the drives it tunes on, the worlds it judges by, and what it says of them."""
 
 import dataclasses
 import re
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,13 +12,9 @@ import pytest
 from programs import Recorder
 
 from jaxlocmap import Gaussian, simulation, tuning
+from jaxlocmap.cli import tune, tune_matching, tune_sources
+from jaxlocmap.cli.tune_sources import Wanted
 from jaxlocmap.matching.submaps import with_defaults
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import tune
-import tune_matching
-import tune_sources
-from tune_sources import Wanted
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
 WANTED = Wanted(("pose_nll",), None, 0.9999, 0.99, 3, False)

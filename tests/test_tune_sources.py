@@ -1,7 +1,6 @@
 """What is tuned on and what it is judged by: other drives, halves and robots; and what the program makes of it."""
 
 import json
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,14 +12,10 @@ from programs import Recorder
 from test_localize import made_log
 
 from jaxlocmap import Config, Gaussian, Params, simulation, tuning
+from jaxlocmap.cli import tune, tune_options, tune_sources
+from jaxlocmap.cli.tune_sources import Wanted
 from jaxlocmap.logs import Log
 from jaxlocmap.mapping.predictive import PredictiveScore
-
-sys.path.append(str(Path(__file__).parent.parent / "experiments"))
-import tune
-import tune_options
-import tune_sources
-from tune_sources import Wanted
 
 pytestmark = pytest.mark.usefixtures("as_a_program")
 START = Params.from_std(v=0.1, w=0.2, range=0.3, bearing=0.4)
@@ -122,7 +117,7 @@ def robots(monkeypatch):
     monkeypatch.setattr(tune_sources, "_WINDOWS", {"woods": (3, 2), "mrclam": (4, 0)})
     filtered, judged = Recorder("info"), Recorder({"anees": 3.0})
     monkeypatch.setattr(tune_sources, "filter_log", filtered)
-    monkeypatch.setattr(tune_sources, "judge", judged)
+    monkeypatch.setattr(tune_sources, "judge_log", judged)
     return SimpleNamespace(filtered=filtered, judged=judged, logs=logs)
 
 
@@ -151,7 +146,7 @@ def test_woods_is_tuned_on_its_first_half_and_judged_on_its_second(robots):
     np.testing.assert_allclose(source.train.prior.cov[0], np.diag([0.05] * 3) ** 2, rtol=1e-6)
     evidence = source.evidence(START)
     assert list(evidence) == ["second half"]
-    ((params, prior, inputs, landmarks, config), _) = robots.filtered.calls[0]
+    ((params, prior, inputs, landmarks, config, _), _) = robots.filtered.calls[0]
     assert params is START
     np.testing.assert_allclose(prior.mean, [2.2, 4.4, 0.22], rtol=1e-6)
     assert len(inputs.dt) == 18

@@ -1,4 +1,13 @@
-"""Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. Nowhere else: matplotlib."""
+"""Figures for people: units on the axes, bands and legends in them. NumPy in, a file out. Nowhere else: matplotlib.
+
+Raises:
+    ModuleNotFoundError: matplotlib is not installed, which the extra `plot` brings.
+"""
+
+import importlib.util
+
+if importlib.util.find_spec("matplotlib") is None:
+    raise ModuleNotFoundError("matplotlib is not installed: expected pip install 'jaxlocmap[plot]'", name="matplotlib")
 
 from jaxlocmap.plotting.graphs import graph_figure, slam_figure
 from jaxlocmap.plotting.maps import map_figure, trajectory_figure

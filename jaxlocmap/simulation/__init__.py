@@ -21,7 +21,9 @@ from jaxlocmap.simulation.robot import (
 from jaxlocmap.simulation.scenario import (
     BUILDING,
     CAPSTONE,
+    KNOWN_START_STD,
     LOOP,
+    MATCH_GAP,
     RANDOM_BUILDING,
     SCENARIOS,
     Detector,
@@ -30,13 +32,18 @@ from jaxlocmap.simulation.scenario import (
     course_params,
     own_motion,
     own_params,
+    scenario_of,
+    with_known_start,
+    world_of,
 )
 from jaxlocmap.simulation.world import World, building, occupancy, random_building, random_room, ray_cast, room
 
 __all__ = [
     "BUILDING",
     "CAPSTONE",
+    "KNOWN_START_STD",
     "LOOP",
+    "MATCH_GAP",
     "RANDOM_BUILDING",
     "SCENARIOS",
     "Detector",
@@ -61,8 +68,11 @@ __all__ = [
     "ray_cast",
     "roll_out",
     "room",
+    "scenario_of",
     "simulate",
     "simulate_graph",
     "simulate_scan",
     "targets",
+    "with_known_start",
+    "world_of",
 ]

@@ -16,6 +16,7 @@ from jaxlocmap._internal.trig import arctan2
 from jaxlocmap.motion import MotionModel
 from jaxlocmap.parameters import Block, Params, Q, R
 from jaxlocmap.se2 import POSE, wrap
+from jaxlocmap.simulation.world import World, building, room
 from jaxlocmap.types import Config, Gaussian, GridSpec
 
 
@@ -77,6 +78,8 @@ class Detector:
         return k % self.period == 0
 
 
+MATCH_GAP = 0.8  # m: `Matcher.gap` for the course's 61 beams, whose ends lie far apart
+KNOWN_START_STD = (1e-3, 1e-3, 1e-3)  # m, m, rad
 _COURSE_GRID = GridSpec(origin=(0.0, 0.0), resolution=0.2, shape=(120, 120))
 
 
@@ -236,3 +239,24 @@ RANDOM_BUILDING = dataclasses.replace(BUILDING, name="random_building")
 """The same rounds, of a building that `world.random_building` draws."""
 
 SCENARIOS = {scenario.name: scenario for scenario in (CAPSTONE, LOOP, BUILDING, RANDOM_BUILDING)}
+
+
+def scenario_of(name: str) -> Scenario:
+    """The scenario of that name.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if name not in SCENARIOS:
+        raise ValueError(f"scenario: expected one of {sorted(SCENARIOS)}, got {name!r}")
+    return SCENARIOS[name]
+
+
+def world_of(scenario: Scenario) -> World:
+    """What stands around the robot of a scenario; for random_building, one of those it may be."""
+    return building() if scenario.name in (BUILDING.name, RANDOM_BUILDING.name) else room()
+
+
+def with_known_start(scenario: Scenario) -> Scenario:
+    """The scenario of a robot whose filter knows the start, to `KNOWN_START_STD`."""
+    return dataclasses.replace(scenario, exact_prior=False, prior_std=KNOWN_START_STD)

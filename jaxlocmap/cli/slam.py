@@ -10,47 +10,40 @@ are near enough to be matched, and the covariance takes nothing from it.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from common import CONSOLE, command_line, count_rows, in_pieces, output_folder, params_or, saved, show, write_report
-from map_log import in_radians, make_map, ready
-from slam_loops import closed, drawn, false_loops, loop_doubts, loop_rows, write_loops
 
-from jaxlocmap import Config, Gaussian, Info, Inputs, Params, State, init, plotting, run
+from jaxlocmap import Config, Params, plotting
+from jaxlocmap.cli.console import CONSOLE, count_rows, output_folder, progress_bar, saved, show, write_report
+from jaxlocmap.cli.options import in_radians, params_or
+from jaxlocmap.cli.slam_loops import loop_doubts, loop_rows, write_loops
 from jaxlocmap.consistency import readable
-from jaxlocmap.logs import Log, Trajectory, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
-from jaxlocmap.logs.relations import Relations, find_stamps, pairs
+from jaxlocmap.graph.trail import trail_of
+from jaxlocmap.logs import Log, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
+from jaxlocmap.logs.relations import Relations, pairs
 from jaxlocmap.mapping import quality
 from jaxlocmap.mapping.ros import save_map
-from jaxlocmap.matching import submaps
-from jaxlocmap.matching.storage import LoadedLines, load_lines, save_lines
+from jaxlocmap.matching.storage import load_lines, save_lines
 from jaxlocmap.monte_carlo.hosts import merge_kernels
-from jaxlocmap.poses import between, compose, wrapped
+from jaxlocmap.poses import compose
+from jaxlocmap.replay import loops as replay_loops
+from jaxlocmap.replay import maps, scans
 from jaxlocmap.se2 import POSE
-from jaxlocmap.types import Matcher
 
-_ANY_SCANS = 2**30  # of a submap, whose travel ends it
-_PIECE = 91  # scans between two moves of the progress bar
-_OLDER = POSE  # entry of the state at which the anchor of the map begins
-_START_STD = (0.2, 0.2, 0.1)  # m, m, rad: of the start on a known map
-_KNOWN_STD = (0.02, 0.005)  # m, rad: errors of a known map
 _STREAK = 3  # scans in a row that are refused: worth a word
-_LEAST_SHARE = (0.2, 0.5)  # of a scan's points, on a map that grows and on a known one, which has every room
 _MANY = 0.2  # of the scans: if more are refused, something is wrong
 
 
 @dataclasses.dataclass(frozen=True)
 class SlamConfig:
-    """Settings of the filter, and what it reads."""
+    """Localise a robot by its laser and wheels alone, map what it sees, and close loops."""
 
     log: tyro.conf.Positional[Path]
     """The log, plain or gzipped: scans with the odometry of each."""
@@ -106,21 +99,34 @@ def main(config: SlamConfig) -> dict[str, Any]:
     _check(config)
     out = output_folder(config.out)
     merge_kernels()
-    log, repeated = in_order(read(config.log, config.format, fov=in_radians(config.fov)))
+    log, repeated = scans.in_order(read(config.log, config.format, fov=in_radians(config.fov)))
     if len(log.scan_odometry) != len(log.scan) or not len(log.scan):
         raise ValueError(f"{config.log}: expected laser scans with odometry, got {len(log.scan)} without")
     if config.quick:
-        log = log.with_scans(slice(_PIECE))
+        log = log.with_scans(slice(scans.PIECE))
     known = None if config.map is None else load_lines(config.map)
     scored = _scored(config, log)
-    params = params_or(config.params, believed(config))
-    settings = settings_of(config, log, known)
+    params = params_or(config.params, scans.believed(config.odometry))
+    settings = scans.settings_of(
+        log,
+        submap_length=config.submap_length if closes(config) else None,
+        half_width=config.half_width,
+        window=config.window,
+        max_range=config.max_range,
+        laser_offset=config.laser_offset,
+        known=known,
+    )
     CONSOLE.print(f"{len(log.scan)} scans of {log.scan.shape[1]} beams; compiling takes some seconds")
     began = time.perf_counter()
-    info, state, took = match_log(params, log, settings, config.start, known)
-    loops = closed(params, log, info, settings, config) if closes(config) else None
-    poses, cov = on_the_map(info) if loops is None else (loops.poses, loops.cov)
-    report = judge(log, info, settings, poses, cov)
+    with progress_bar("matching", len(log.scan)) as progress:
+        info, state, took = scans.match_log(params, log, settings, config.start, known, progress)
+    loops = None
+    if closes(config):
+        trail, how = trail_of(info.match), {"start": config.start, "kernel": config.kernel}
+        with progress_bar("closing loops", trail.submaps) as progress:
+            loops = replay_loops.closed(params, log, trail, settings, progress=progress, **how)
+    poses, cov = scans.on_the_map(info) if loops is None else (loops.poses, loops.cov)
+    report = scans.match_report(log, info, settings, poses, cov)
     report["counts"] = {**log.counts, "repeated_stamps": repeated}
     report |= took | {"params": params.numbers()}
     report |= {name: _errors(log.scan_time, poses, relations) for name, relations in scored.items()}
@@ -130,12 +136,12 @@ def main(config: SlamConfig) -> dict[str, Any]:
     else:
         names += write_loops(out, loops, log, report)
         if config.reference is not None:
-            reference = at_stamps(read_trajectory(config.reference), log.scan_time)
-            report["closure"]["false_kept"] = false_loops(loops, reference)
+            reference = scans.at_stamps(read_trajectory(config.reference), log.scan_time)
+            report["closure"]["false_kept"] = replay_loops.false_loops(loops, reference)
         if config.online:
             write_tum(out / "online.tum", log.scan_time, loops.online)
             names.append("online.tum")
-        lines = drawn(log, settings, poses, info.match.accepted | info.match.anew, config.half_width)
+        lines = replay_loops.drawn(log, settings, poses, info.match.accepted | info.match.anew, config.half_width)
     if lines is not None and settings.matcher is not None:
         save_lines(out / "lines.npz", lines, dataclasses.replace(settings.matcher, half_width=config.half_width))
         names.append("lines.npz")
@@ -160,12 +166,6 @@ def _check(config: SlamConfig) -> None:
     in_radians(config.fov)
 
 
-def in_order(log: Log) -> tuple[Log, int]:
-    """The scans sorted by stamp, the first of each, and how many stamps repeated one."""
-    _, first = np.unique(log.scan_time, return_index=True)
-    return log.with_scans(first), len(log.scan_time) - len(first)
-
-
 def _scored(config: SlamConfig, log: Log) -> dict[str, Relations]:
     """What the trajectory is to be scored by; read before anything is computed."""
     scored = {}
@@ -187,132 +187,13 @@ def closes(config: SlamConfig) -> bool:
     return config.closure and config.map is None
 
 
-def at_stamps(reference: Trajectory, time: np.ndarray) -> np.ndarray:
-    """The poses of a reference at the stamps of scans, (S, 3), NaN where it has none."""
-    place, known = find_stamps(reference.time, time)
-    return np.where(known[:, None], reference.pose[place], np.nan)
-
-
-def believed(config: SlamConfig) -> Params:
-    return submaps.with_defaults(Params.from_std(odometry=config.odometry))
-
-
-def settings_of(config: SlamConfig, log: Log, known: LoadedLines | None) -> Config:
-    """Submaps, one map without an end, or one that is known."""
-    reach = min(config.max_range, log.scan_max_range)
-    submap = closes(config)
-    half_width = reach + 2 * config.submap_length if submap else config.half_width
-    matcher = Matcher(
-        submap_scans=_ANY_SCANS if submap else None,
-        submap_length=config.submap_length,
-        resolution=0.1 if known is None else known.resolution,
-        half_width=half_width if known is None else known.half_width,
-        steps=20,
-        window=config.window,
-        least_share=_LEAST_SHARE[known is not None],
-        known_std=None if known is None else _KNOWN_STD,
-    )
-    return Config(
-        dt=1.0,  # a scan, whatever time it took: the noise of the odometry grows with the way
-        motion="odometry",
-        matcher=matcher,
-        max_range=reach,
-        scanner_offset=config.laser_offset,
-    )
-
-
-@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
-def _piece(
-    params: Params, state: State, inputs: Inputs, beam_angles: jax.Array, *, config: Config
-) -> tuple[State, Info]:
-    return run(params, state, inputs, beam_angles=beam_angles, config=config)
-
-
-def match_log(
-    params: Params, log: Log, config: Config, start: tuple[float, float, float], known: LoadedLines | None
-) -> tuple[Info, State, dict[str, float]]:
-    """`run` in equal pieces so that a bar can move; the last is filled up with scans of nothing.
-
-    Returns:
-        What every scan reports, the last state, and seconds: of compiling, and of a scan.
-    """
-    scans, angles = len(log.scan), jnp.asarray(log.beam_angles, jnp.float32)
-    steps = np.concatenate([np.zeros((1, POSE)), between(log.scan_odometry[:-1], log.scan_odometry[1:])])
-    fill = -scans % _PIECE
-    inputs = Inputs(
-        dt=jnp.ones(scans + fill),
-        control=jnp.asarray(np.concatenate([steps, np.zeros((fill, POSE))]), jnp.float32),
-        landmark=jnp.zeros((scans + fill, 0), jnp.int32),
-        z=jnp.zeros((scans + fill, 0, 2)),
-        valid=jnp.zeros((scans + fill, 0), bool),
-        ranges=jnp.asarray(np.concatenate([log.scan, np.full((fill, log.scan.shape[1]), np.nan)]), jnp.float32),
-    )
-    std = jnp.array(_START_STD if known else (0.0, 0.0, 0.0))
-    state = init(Gaussian(jnp.array(start), jnp.diag(std**2)), config=config)
-    if known is not None and config.matcher is not None:
-        state = state._replace(submaps=submaps.known(jnp.asarray(known.lines), config.matcher, state.belief.mean.dtype))
-    began = time.perf_counter()
-    first = jax.tree.map(lambda x: x[:_PIECE], inputs)
-    program = _piece.lower(params, state, first, angles, config=config).compile()
-    compiled = time.perf_counter()
-
-    def turn(state: State, piece: Inputs) -> tuple[State, Info]:
-        return program(params, state, piece, angles)
-
-    state, info = in_pieces(turn, state, inputs, scans, _PIECE, "matching")
-    each = 1e3 * (time.perf_counter() - compiled) / (scans + fill)
-    return info, state, {"compile_s": compiled - began, "ms_per_scan": each}
-
-
-def on_the_map(info: Info) -> tuple[np.ndarray, np.ndarray]:
-    """The poses on the map, (S, 3): those that its lines were drawn at; and the covariances of the poses since the
-    start, (S, 3, 3).
-    """
-    mean = np.asarray(info.belief.mean, np.float64)
-    local = np.asarray(jax.vmap(lambda mean: submaps.relative_pose(mean, _OLDER)[0])(info.belief.mean), np.float64)
-    poses = compose(mean[:, _OLDER : _OLDER + POSE], local)
-    poses[:, 2] = wrapped(poses[:, 2])
-    return poses, np.asarray(info.belief.cov, np.float64)[:, :POSE, :POSE]
-
-
-def judge(log: Log, info: Info, config: Config, poses: np.ndarray, cov: np.ndarray) -> dict[str, Any]:
-    """What the matches say of themselves."""
-    match, matcher = info.match, config.matcher
-    if matcher is None:
-        raise ValueError("config.matcher: expected a Matcher, got None")
-    refused = jax.tree.map(np.asarray, submaps.refusals(match, matcher))
-    tried = int(match.tried.sum())
-    at = np.concatenate([[-1], np.flatnonzero(match.accepted | match.anew), [len(match.accepted)]])
-    streaks = np.diff(at) - 1
-    longest = int(np.argmax(streaks))
-    sigma = np.sqrt(np.maximum(np.diagonal(cov, axis1=1, axis2=2), 0))
-    return {
-        "log": log.name,
-        "scans": len(log.scan),
-        "beams": log.scan.shape[1],
-        "path_m": float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()),
-        "matched": int(match.accepted.sum()),
-        "tried": tried,
-        "refused": {name: int(reason.sum()) for name, reason in refused._asdict().items()},
-        "refused_most_in_a_row": int(streaks[longest]),
-        "refused_most_from_s": float(log.scan_time[at[longest] + 1]) if streaks[longest] else None,
-        "nis_mean": float(match.nis[match.accepted].mean()) if match.accepted.any() else None,
-        "nis_median": float(np.median(match.nis[match.accepted])) if match.accepted.any() else None,
-        "points_used": float((match.used / np.maximum(match.points, 1))[match.tried].mean()) if tried else 0.0,
-        "flagged": int((~info.ok).sum()),
-        "sigma_position_end_m": float(np.hypot(sigma[-1, 0], sigma[-1, 1])),
-        "sigma_position_most_m": float(np.hypot(sigma[:, 0], sigma[:, 1]).max()),
-        "sigma_heading_end_rad": float(sigma[-1, 2]),
-    }
-
-
 def doubts(report: Mapping[str, Any], config: SlamConfig) -> list[str]:
     """What a user should know before trusting the result."""
-    said, scans, refused = [], report["scans"], report["refused"]
-    if report["matched"] + 1 < (1 - _MANY) * scans:
+    said, count, refused = [], report["scans"], report["refused"]
+    if report["matched"] + 1 < (1 - _MANY) * count:
         reasons = ", ".join(f"{name} {count}" for name, count in refused.items())
         where = "is it the map of this place, and --start on it" if config.map else "do --odometry and --fov fit"
-        said.append(f"{scans - report['matched']} of {scans} scans were not matched ({reasons}): {where}?")
+        said.append(f"{count - report['matched']} of {count} scans were not matched ({reasons}): {where}?")
     if (most := report["refused_most_in_a_row"]) >= _STREAK:
         said.append(
             f"{most} scans in a row were not matched, from {report['refused_most_from_s']:.3f} s on: there the pose is "
@@ -352,8 +233,9 @@ def _write(
     """The trajectory, and the occupancy map made at its poses; the names of what was written."""
     write_tum(out / "estimate.tum", log.scan_time, poses)
     seen = dataclasses.replace(log, truth=compose(poses, config.laser_offset), truth_time=log.scan_time)
-    local, spec, mapping = ready(seen, config.resolution, config.max_range)
-    log_odds, _, _ = make_map(params, local, mapping)
+    local, spec, mapping = maps.mappable(seen, config.resolution, config.max_range)
+    with progress_bar("mapping", len(log.scan)) as progress:
+        log_odds, _, _ = maps.make_map(params, local, mapping, progress)
     cells = save_map(out, log_odds, spec, name="map")
     how = "with loops closed" if closes(config) else "matched one after the other"
     title = f"{log.name}: {len(poses)} scans {how}, cells of {config.resolution:g} m"
@@ -386,7 +268,3 @@ def _show(name: str, report: Mapping[str, Any]) -> None:
                 ("  rotation", f"{score['rotation_deg']:.2f}°, median {score['rotation_median_deg']:.2f}°", ""),
             ]
     show(name, [*rows, *count_rows(report["counts"])])
-
-
-if __name__ == "__main__":
-    command_line(main, SlamConfig)

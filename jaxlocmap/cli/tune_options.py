@@ -1,4 +1,4 @@
-"""The options of tune.py: which there are, what each applies to, and what is asked of its value."""
+"""The options of `tune`: which there are, what each applies to, and what is asked of its value."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from common import check_gate
-from tune_matching import MATCHING_NOISE
-from tune_sources import JUDGE_GATE, TUNING_GATE
-
 from jaxlocmap import tuning
+from jaxlocmap.cli.options import check_gate
+from jaxlocmap.cli.tune_matching import MATCHING_NOISE
+from jaxlocmap.cli.tune_sources import JUDGE_GATE, TUNING_GATE
 from jaxlocmap.logs import MAX_GAP
 
 
 @dataclasses.dataclass(frozen=True)
 class TuneConfig:
-    """What to tune, on what, and what for. An option that does not apply to that is refused."""
+    """Tune the noise a filter believes in, or its map's sensor model, on simulated drives or a log."""
 
     scenario: Literal["capstone", "loop"] | None = None
     """Simulated drives to tune on where there is no log, capstone by default."""

@@ -1,29 +1,27 @@
-"""Closed loops of a laser log: from what the filter's matches report to the corrected poses, and words on them."""
+"""Closed loops of a laser log: from what the filter's matches report to the corrected poses."""
 
 from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import progress_bar
 
-from jaxlocmap import Config, Info, Params, graph, plotting
 from jaxlocmap.graph.closure import Closed, Closure, close_loops, scan_poses
-from jaxlocmap.graph.trail import Trail, trail_of
-from jaxlocmap.logs import Log, write_csv, write_g2o
+from jaxlocmap.graph.trail import Trail
+from jaxlocmap.logs import Log
 from jaxlocmap.matching import lines as line_grid
 from jaxlocmap.matching.normals import Points, surface_points
 from jaxlocmap.matching.submaps import BLOCKS
+from jaxlocmap.parameters import Params
 from jaxlocmap.poses import between, compose, wrapped
-from jaxlocmap.types import Matcher, Scanner
+from jaxlocmap.types import Config, Matcher, Scanner
 
-_KEPT = 0.5  # a loop of less weight is not kept
+KEPT = 0.5  # a loop of less weight is not kept
 _FALSE = (0.4, 0.1)  # m, rad: a loop farther off the reference than this is false
 
 
@@ -38,22 +36,38 @@ class Loops(NamedTuple):
     seconds: float  # of closing, compilation included
 
 
-def closed(params: Params, log: Log, info: Info, settings: Config, config: Any) -> Loops:
-    """Close the loops of a log under a bar.
+def closed(
+    params: Params,
+    log: Log,
+    trail: Trail,
+    config: Config,
+    *,
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    kernel: str = "gnc",
+    progress: Callable[[int], None] = lambda done: None,
+) -> Loops:
+    """Close the loops of a log.
 
     Args:
-        info: of the filter, (S,) scans.
-        config: the program's, with `start` and `kernel`.
+        params: of the filter.
+        log: S scans.
+        trail: of the submaps that the filter matched them on (`graph.trail.trail_of`).
+        config: of the filter.
+        start: the first pose, m, m, rad.
+        kernel: how loops count that do not fit the others.
+        progress: called with the number of submaps done so far.
+
+    Raises:
+        ValueError: a filter that matches no scans.
     """
-    matcher = settings.matcher
+    matcher = config.matcher
     if matcher is None:
-        raise ValueError("settings.matcher: expected a Matcher, got None")
+        raise ValueError("config.matcher: expected a Matcher, got None")
     began = time.perf_counter()
-    trail = trail_of(info.match)
-    points = surfaces(log.scan, log.beam_angles, settings)
+    points = surfaces(log.scan, log.beam_angles, config)
     std, scale, _ = (jnp.asarray(params.block(block), jnp.float32) for block in BLOCKS)
-    with jax.enable_x64(True), progress_bar("closing loops", trail.submaps) as progress:
-        first = np.asarray(config.start, np.float64)
+    with jax.enable_x64(True):
+        first = np.asarray(start, np.float64)
         found = close_loops(
             trail,
             points,
@@ -62,7 +76,7 @@ def closed(params: Params, log: Log, info: Info, settings: Config, config: Any) 
             spec=matcher.spec,
             closure=Closure(),
             first=first,
-            kernel=config.kernel,
+            kernel=kernel,
             progress=progress,
         )
         poses, cov = scan_poses(trail, found)
@@ -101,34 +115,6 @@ def drawn(log: Log, settings: Config, poses: np.ndarray, counts: np.ndarray, hal
     return np.asarray(all_of(jnp.asarray(poses, jnp.float32), jnp.asarray(counts), points))
 
 
-def write_loops(out: Path, loops: Loops, log: Log, report: dict[str, Any]) -> list[str]:
-    """The graph, the poses with their covariances and the picture; what the report says of them."""
-    found, solution = loops.closed, loops.closed.solution
-    accepted = found.attempts.pair[found.attempts.accepted]
-    weights = np.asarray(solution.weights)[: len(accepted)]
-    report["closure"] = {
-        "submaps": loops.trail.submaps,
-        "tried": len(found.attempts.accepted),
-        "accepted": len(accepted),
-        "kept": int(np.sum(weights > _KEPT)),
-        "chi2": float(solution.objective),
-        "converged": bool(solution.converged),
-        "seconds": loops.seconds,
-    }
-    anchors = np.asarray(solution.poses, np.float64)
-    write_g2o(out / "graph.g2o", found.graph, anchors, np.arange(len(anchors)))
-    write_csv(out / "poses.csv", log.scan_time, loops.poses, loops.cov)
-    with jax.enable_x64(True):
-        begin = np.asarray(graph.dead_reckoning(found.graph, jnp.asarray(anchors[0])))
-    trail = loops.trail
-    before = compose(begin[np.maximum(trail.submap, 0)], trail.place)
-    title = f"{log.name}: {trail.submaps} submaps, {len(accepted)} loops, drawn between the submaps' middles"
-    plotting.graph_figure(
-        out / "graph.png", loops.poses, loops.cov, trail.middle[accepted], weights, before=before, title=title
-    )
-    return ["graph.g2o", "poses.csv", "graph.png"]
-
-
 def false_loops(loops: Loops, reference: np.ndarray) -> int:
     """How many loops that were kept disagree with reference poses by more than 0.4 m or 0.1 rad.
 
@@ -140,7 +126,7 @@ def false_loops(loops: Loops, reference: np.ndarray) -> int:
     """
     trail, attempts = loops.trail, loops.closed.attempts
     accepted = np.flatnonzero(attempts.accepted)
-    kept = accepted[np.asarray(loops.closed.solution.weights)[: len(accepted)] > _KEPT]
+    kept = accepted[np.asarray(loops.closed.solution.weights)[: len(accepted)] > KEPT]
     known = np.isfinite(reference[:, 0]) & trail.drawn
     count = 0
     for k in kept:
@@ -164,32 +150,3 @@ def is_false(trail: Trail, reference: np.ndarray, a: Any, b: Any, moved: np.ndar
     """
     off = between(reference[a], reference[b]) - between(trail.place[a], compose(moved, trail.place[b]))
     return (np.hypot(off[..., 0], off[..., 1]) > _FALSE[0]) | (np.abs(wrapped(off[..., 2])) > _FALSE[1])
-
-
-def loop_rows(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Rows of the table."""
-    if "closure" not in report:
-        return []
-    said = report["closure"]
-    return [
-        ("submaps", str(said["submaps"]), ""),
-        ("loops tried, accepted, kept", f"{said['tried']}, {said['accepted']}, {said['kept']}", ""),
-        ("closing loops", f"{said['seconds']:.1f} s", ""),
-        *([("false loops kept", str(said["false_kept"]), "0")] if "false_kept" in said else []),
-    ]
-
-
-def loop_doubts(report: Mapping[str, Any]) -> list[str]:
-    """What a user should know of the loops before trusting the result."""
-    if "closure" not in report:
-        return []
-    said, doubts = report["closure"], []
-    if not said["accepted"]:
-        doubts.append("no loop was closed: the poses are those of the filter, and so is their covariance")
-    if said["kept"] < 0.9 * said["accepted"]:
-        doubts.append(
-            f"{said['accepted'] - said['kept']} of {said['accepted']} loops do not fit the others: false ones?"
-        )
-    if not said["converged"]:
-        doubts.append("the graph of the loops did not converge: the poses are the best on the way")
-    return doubts

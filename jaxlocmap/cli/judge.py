@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import CONSOLE, check_gate, command_line, count_rows, output_folder, progress_bar, saved, show, write_report
-from report_table import innovation_rows, pose_rows, print_verdicts
 
 from jaxlocmap import consistency, plotting
+from jaxlocmap.cli.console import CONSOLE, count_rows, output_folder, progress_bar, saved, show, write_report
+from jaxlocmap.cli.options import check_gate
+from jaxlocmap.cli.rows import innovation_rows, pose_rows, print_verdicts
 from jaxlocmap.consistency import Innovations, judge, readable
 from jaxlocmap.logs import Pairs, pair, read_innovations, read_trajectory
 
@@ -19,10 +20,10 @@ _QUICK = 2000  # steps of each run
 
 @dataclasses.dataclass(frozen=True)
 class JudgeConfig:
-    """What to judge. Several pairs of files are several runs of one filter."""
+    """Can the covariance of your own filter be believed? True poses and estimates from files, and a verdict."""
 
     truth: tuple[Path, ...]
-    """True poses, one file a run: TUM (timestamp x y z qx qy qz qw) or CSV (t, x, y, theta)."""
+    """True poses, one file a run of the filter: TUM (timestamp x y z qx qy qz qw) or CSV (t, x, y, theta)."""
     estimate: tuple[Path, ...]
     """The filter's poses with their covariances, in the same order: TUM and then the entries of a covariance, or CSV
     with columns t, x, y, theta and xx, xy, xt, yy, yt, tt, or cov_0 to cov_35 of a ROS PoseWithCovariance."""
@@ -131,7 +132,3 @@ def _print(report: dict[str, Any], title: str) -> None:
             f"y {y0:.3g} to {y1:.3g} m): NEES {readable(span['anees'])}",
         )
     print_verdicts(report)
-
-
-if __name__ == "__main__":
-    command_line(main, JudgeConfig)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from common import CONSOLE
-
 from jaxlocmap import consistency
+from jaxlocmap.cli.console import CONSOLE
 from jaxlocmap.consistency import readable
 
 Rows = list[tuple[str, str, str]]  # quantity, measured, what a consistent filter gives

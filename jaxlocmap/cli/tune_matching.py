@@ -1,4 +1,4 @@
-"""What tune.py --match tunes on and judges by: a filter that matches scans, in rooms and buildings drawn anew."""
+"""What `tune --match` tunes on and judges by: a filter that matches scans, in rooms and buildings drawn anew."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import EXACT, GAP, scenario_world, with_known_start
-from tune_sources import GATE_TEMPERATURE, Evidence, Source, Wanted, judged_by_study
 
 from jaxlocmap import Gaussian, Params, simulation, tuning
+from jaxlocmap.cli.tune_sources import GATE_TEMPERATURE, Evidence, Source, Wanted, judged_by_study
 from jaxlocmap.matching.submaps import with_defaults
+from jaxlocmap.simulation import KNOWN_START_STD, MATCH_GAP, random_room, with_known_start, world_of
 from jaxlocmap.simulation.scenario import LOOP_CENTRE, LOOP_RADIUS
-from jaxlocmap.simulation.world import random_room
 from jaxlocmap.types import Matcher
 
 MATCHING_NOISE = ("v", "w", "match_std", "match_scale", "map_length")
-MATCHER = Matcher(period=5, gap=GAP)
+MATCHER = Matcher(period=5, gap=MATCH_GAP)
 _STEPS = 300  # of a drive: some six submaps
 _CLEAR = 0.4  # m: how far from the circle of the loop the box of a room must stand
 _JUDGES = (dataclasses.replace(simulation.LOOP, steps=2400), simulation.BUILDING)
@@ -79,7 +78,7 @@ def in_buildings(key: jax.Array, count: int, steps: int) -> tuning.Batch:
     noise = simulation.Noise()
     whole = tuning.simulated(of_drives, count, worlds, noise, scenario=scenario, scans=True, worlds=True)
     truth = np.asarray(whole.truth)
-    known = np.broadcast_to(np.diag(np.square(EXACT)), (*truth.shape, truth.shape[-1]))
+    known = np.broadcast_to(np.diag(np.square(KNOWN_START_STD)), (*truth.shape, truth.shape[-1]))
     pieces = tuning.windows(whole, steps, run_in=0, beliefs=Gaussian(jnp.asarray(truth), jnp.asarray(known)))
     per_round = -(-a_round // steps)
     return tuning.pick(pieces, np.arange(count) * per_round + np.arange(count) % per_round)
@@ -94,9 +93,9 @@ def _studied(
     key: jax.Array,
     wanted: Wanted,
 ) -> dict[str, Any]:
-    """A study without landmarks, as consistency.py --match --no-landmarks --exact-prior --no-map makes it."""
+    """A study without landmarks, as `study --match --no-landmarks --exact-prior --no-map` makes it."""
     config = scenario.config(motion=motion, gate_probability=wanted.judge_gate, grid=False)
     config = dataclasses.replace(config, matcher=MATCHER)
-    world = scenario_world(scenario)
+    world = world_of(scenario)
     world = world._replace(landmarks=world.landmarks[:0])
     return judged_by_study(jax.random.fold_in(key, 3), runs, params, world, noise, scenario=scenario, config=config)

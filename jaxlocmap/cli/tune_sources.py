@@ -1,4 +1,4 @@
-"""What tune.py tunes on and what it judges the result by: a scenario, or the logs of real robots."""
+"""What `tune` tunes on and what it judges the result by: a scenario, or the logs of real robots."""
 
 from __future__ import annotations
 
@@ -11,16 +11,26 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from common import CONSOLE, scenario_of
-from localize import PERIOD, PRIOR_STD, believed, filter_log, first_pose, judge, offset_of, prior_at, time_sentences
-from map_log import ready, say_doubts
 
 from jaxlocmap import Config, Gaussian, Params, simulation, tuning
+from jaxlocmap.cli.console import CONSOLE, progress_bar
 from jaxlocmap.consistency.study import Study, summarise
 from jaxlocmap.logs import MAX_GAP, Log, Timeline, read, to_timeline
 from jaxlocmap.mapping.predictive import PredictiveScore
 from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.simulation.world import random_room
+from jaxlocmap.replay import maps
+from jaxlocmap.replay.landmarks import (
+    PERIOD,
+    PRIOR_STD,
+    believed,
+    filter_log,
+    first_pose,
+    judge_log,
+    offset_of,
+    prior_at,
+    time_doubts,
+)
+from jaxlocmap.simulation import random_room, scenario_of
 
 Evidence = dict[str, Any]
 TUNING_GATE, JUDGE_GATE = 0.9999, 0.99
@@ -166,8 +176,9 @@ def from_scans(path: Path, resolution: float, max_range: float, wanted: Wanted) 
     log = read(path, "carmen")
     scans = min(len(log.scan), 60) if wanted.quick else len(log.scan)
     log = log.with_scans(slice(scans))
-    mapped, _, config = ready(log, resolution, max_range)
-    say_doubts(log, config.max_range)
+    mapped, _, config = maps.mappable(log, resolution, max_range)
+    for sentence in maps.scan_doubts(log, config.max_range):
+        CONSOLE.print(sentence, soft_wrap=True)
     half = scans // 2
     whole = _scans(mapped, scans)
     first = _scans(mapped, half)
@@ -209,7 +220,7 @@ def _timeline(
     if not len(log.truth_time):
         raise ValueError(f"{path}: expected a log with truth, to start from, to judge by and for some losses, got none")
     timeline = to_timeline(log, max_range=max_range, start=float(log.truth_time.min()), max_gap=wanted.max_gap)
-    for sentence in time_sentences(log, timeline.counts, wanted.max_gap):
+    for sentence in time_doubts(log, timeline.counts, wanted.max_gap):
         CONSOLE.print(f"careful: {log.name}: {sentence}")
     return log, _cut(timeline, 0, 6000 if kind == "mrclam" else 2400) if wanted.quick else timeline
 
@@ -242,8 +253,10 @@ def _windows(timeline: Timeline, log: Log, start: Params, config: Config, length
 
 
 def _judged(params: Params, log: Log, timeline: Timeline, config: Config) -> Evidence:
-    info = filter_log(params, prior_at(first_pose(log, timeline)), timeline.inputs, log.landmarks, config)
-    report = judge(log, timeline, info, config)
+    prior = prior_at(first_pose(log, timeline))
+    with progress_bar("filtering", len(timeline.time)) as progress:
+        info = filter_log(params, prior, timeline.inputs, log.landmarks, config, progress)
+    report = judge_log(log, timeline, info, config)
     return report | {"time": timeline.time}
 
 

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from common import CONSOLE, command_line, output_folder, saved, show, write_report
-from report_table import pose_rows, print_verdicts
 
 from jaxlocmap import graph, plotting
+from jaxlocmap.cli.console import CONSOLE, output_folder, saved, show, write_report
+from jaxlocmap.cli.rows import pose_rows, print_verdicts
 from jaxlocmap.consistency import chi2_quantile, judge, readable
 from jaxlocmap.graph import Kernel, Solution
 from jaxlocmap.graph.kernels import GOOD
@@ -40,7 +40,7 @@ _GRAPHS = (".g2o", ".graph", ".toro")
 
 @dataclasses.dataclass(frozen=True)
 class GraphConfig:
-    """What to optimise, and how."""
+    """Optimise a pose graph, and say how far its poses can be believed and which loops do not fit."""
 
     file: tyro.conf.Positional[Path]
     """The graph, plain or gzipped: g2o or TORO, told apart by their tags, or iSAM with --isam."""
@@ -264,7 +264,3 @@ def _show(report: dict[str, Any]) -> None:
         CONSOLE.print(f"and {more} more, see report.json")
     if "judged" in report:
         print_verdicts(report["judged"])
-
-
-if __name__ == "__main__":
-    command_line(main, GraphConfig)
