@@ -128,7 +128,7 @@ def main(config: CapstoneConfig) -> dict[str, Any]:
             ("map entropy", f"{report['map_entropy_bits']:.1f} bits", ""),
         ],
     )
-    CONSOLE.print("one run; for whether the covariance can be believed, run consistency.py")
+    CONSOLE.print("one run; for whether the covariance can be believed, run jaxlocmap study")
     saved(out, "report.json", "trajectory.png", "map.png")
     return report
 

@@ -1,4 +1,4 @@
-"""The tables of the README, between the marks that name them."""
+"""The tables of the README and of the page of evidence, between the marks that name them."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from pathlib import Path
 
 from jaxlocmap import files
 
-_README = Path(__file__).parent.parent / "README.md"
+_PAGES = (Path(__file__).parent / "README.md", Path(__file__).parent.parent / "README.md")
 
 
 def replace_table(name: str, table: str) -> None:
-    """Put a table in the place of the one of that name.
+    """Put a table in the place of the one of that name, on the page that has it.
 
     Raises:
-        ValueError: there is none.
+        ValueError: none has.
     """
     begin, end = f"<!-- table: {name} -->\n", f"<!-- end: {name} -->"
-    head, found, rest = _README.read_text().partition(begin)
-    _, ended, tail = rest.partition(end)
-    if not (found and ended):
-        raise ValueError(f"{_README}: expected the marks {begin.strip()} and {end}")
-    files.write(_README, head + begin + table + "\n" + end + tail)
+    for page in _PAGES:
+        head, found, rest = page.read_text().partition(begin)
+        _, ended, tail = rest.partition(end)
+        if found and ended:
+            files.write(page, head + begin + table + "\n" + end + tail)
+            return
+    raise ValueError(f"{' or '.join(map(str, _PAGES))}: expected the marks {begin.strip()} and {end}")

@@ -71,7 +71,7 @@ class TablesConfig:
     out: Path = Path("out/readme_tables")
     """Folder for the reports behind the tables, and plant.json."""
     quick: bool = False
-    """Studies of 100 runs, one of 8 short runs of matching, the beginning of each log, and none for `slam.py`."""
+    """Studies of 100 runs, one of 8 short runs of matching, the beginning of each log, and none of `jaxlocmap slam`."""
 
 
 def main(config: TablesConfig) -> dict[str, str]:

@@ -89,7 +89,7 @@ def _studies(
             progress(n + 1)
     references: list[Totals] = []
     disturbed = scenario.exact_prior or gate is not None
-    if disturbed:  # each study beside a reference of its own, as consistency.py has it
+    if disturbed:  # each study beside a reference of its own, as `jaxlocmap study` has it
         with progress_bar("references", count) as progress:
             for n in range(count):
                 drawn = jax.random.fold_in(key, count + n)

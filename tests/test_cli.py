@@ -149,12 +149,14 @@ def test_what_was_not_dropped_gets_no_row():
 
 
 def test_a_table_takes_the_place_of_the_one_between_its_marks(monkeypatch, tmp_path):
-    readme = tmp_path / "README.md"
+    pages = tmp_path / "a.md", tmp_path / "b.md"
     text = "a\n<!-- table: x -->\nold\n<!-- end: x -->\nb\n<!-- table: y -->\nkept\n<!-- end: y -->\nc\n"
-    readme.write_text(text)
-    monkeypatch.setattr(evidence, "_README", readme)
+    pages[0].write_text("nothing here\n")
+    pages[1].write_text(text)
+    monkeypatch.setattr(evidence, "_PAGES", pages)
     evidence.replace_table("x", "new\nlines")
-    assert readme.read_text() == text.replace("old", "new\nlines")
+    assert pages[1].read_text() == text.replace("old", "new\nlines")
+    assert pages[0].read_text() == "nothing here\n"
     with pytest.raises(ValueError, match="expected the marks <!-- table: z --> and <!-- end: z -->"):
         evidence.replace_table("z", "new")
 

@@ -54,7 +54,7 @@ def judge(
         gate_probability: the share of good observations the gate is to let in; None: no gate.
 
     Returns:
-        The fields of the report of `experiments/consistency.py`, ready for JSON: ANEES with its band, NEES over time,
+        The fields of the report of `jaxlocmap study`, ready for JSON: ANEES with its band, NEES over time,
         in ten equal phases and of each axis, coverage of the 50, 90, 95 and 99 % ellipsoids, shares within ±2σ,
         each with its 95 % interval, and `verdict`. Of many runs the bands come from the spread between them; of one run
         from the correlation time of its values, and `independent_samples` says how many independent ones it is worth.

@@ -1,4 +1,19 @@
-"""Readers of robot logs, one a format, all returning one `Log`, and the steps made of it."""
+"""Readers of robot logs, one a format, all returning one `Log`, and the steps made of it.
+
+| format | log | owner |
+|---|---|---|
+| `woods` | "Lost in the woods", MATLAB file | T. D. Barfoot, University of Toronto |
+| `mrclam` | UTIAS Multi-Robot Cooperative Localization and Mapping | Leung, Halpern, Barfoot & Liu, IJRR 2011 |
+| `carmen` | laser scans with poses or odometry (FLASER, ROBOTLASER1, RAWLASER1) | D. Hähnel (Intel), MIT (CSAIL) |
+
+- A pause of the odometry longer than `max_gap` stops the robot: the last command holds for the log's usual period, then
+  the robot stands while its covariance grows by `Q`. Truth is not interpolated over longer gaps.
+- A range at or beyond the largest that counts, or no return (inf), clears up to there and marks nothing; no other limit
+  applies but the scanner's own, where the log states it.
+- Beams point where the log says (ROBOTLASER1, RAWLASER1, PARAM lines) or `fov` does; else 180° are assumed, which
+  `Log.beam_angles_from` says.
+- What is dropped or mended is counted in `Log.counts`.
+"""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def load_map(path: str | Path) -> LoadedMap:
     try:
         import yaml  # needed here alone, so it is no dependency of the library
     except ImportError as error:
-        raise ImportError("load_map needs PyYAML: pip install 'jaxlocmap[experiments]'") from error
+        raise ImportError("load_map needs PyYAML: pip install 'jaxlocmap[cli]'") from error
 
     class Loader(yaml.SafeLoader):
         def compose_node(self, parent: Any, index: Any) -> Any:

@@ -165,7 +165,7 @@ def matching_figure(path: Path, report: dict[str, Any]) -> None:
 
 
 def sweep_figure(path: Path, report: dict[str, Any], labels: tuple[str, str], ticks: tuple[list[str], ...]) -> None:
-    """ANEES and position RMSE of every cell of a sweep, the consistent ones outlined, as in the report of sweep.py.
+    """ANEES and position RMSE of every cell of a sweep, the consistent ones outlined, from the report of such.
 
     Where none is consistent, the one that fits best is outlined instead, and the legend says so.
 

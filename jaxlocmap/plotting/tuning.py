@@ -17,7 +17,7 @@ _BEFORE, _AFTER = EXPECTED, ESTIMATE
 
 
 def descent_figure(path: Path, report: dict[str, Any]) -> None:
-    """Loss, parameters and gradient step by step, as in the report of tune.py."""
+    """Loss, parameters and gradient step by step, as in the report of `jaxlocmap tune`."""
     trace, tuned = report["trace"], report["parameters"]
     figure = Figure(figsize=(14, 4.8), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
@@ -89,7 +89,7 @@ def log_before_after_figure(path: Path, drives: dict[str, dict[str, Any]]) -> No
 
 
 def calibration_figure(path: Path, before: dict[str, Any], after: dict[str, Any], what: str) -> None:
-    """Of the cells the map calls p, how many does the next beam end in? As in the report of tune.py."""
+    """Of the cells the map calls p, how many does the next beam end in? As in the report of `jaxlocmap tune`."""
     figure = Figure(figsize=(11, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot([0, 1], [0, 1], color=TRUTH, ls=":", label="calibrated")
