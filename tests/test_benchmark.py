@@ -181,5 +181,5 @@ def test_quick_writes_its_report_and_tables(quick):
     for line in ("study without maps", "study with maps", "the same, plain Python", "jaxlocmap"):
         assert line in tables
         assert line in printed
-    shown = [line for line in printed.splitlines() if not line.startswith("wrote")]  # that one holds a path
+    shown = [line for line in printed.splitlines() if not line.startswith(("wrote", "tracing"))]  # those hold paths
     assert max(map(len, shown)) <= 100

@@ -204,6 +204,9 @@ def test_another_fit_of_the_same_shapes_compiles_nothing(optimiser):
     (traced, first), (again, second) = seen
     assert again == traced > 0
     assert (first > 0, second) == (True, 0)
+    # Nor do standard errors: the same program says how the gradient changes.
+    tuning.standard_errors(objective, found.params, weights(1.0, 2.0), ("range",))
+    assert objective.traced == traced
 
 
 @pytest.mark.parametrize(
@@ -222,7 +225,7 @@ def test_a_line_is_searched_for_a_lower_and_flatter_place(value, slope, end, eva
 
     def evaluated(theta):
         asked.append(float(theta["x"]))
-        return Evaluation(value(asked[-1]), {"x": slope(asked[-1])}, None, None)
+        return Evaluation(value(asked[-1]), {"x": slope(asked[-1])}, None, None, None)
 
     start = {"x": jnp.zeros(())}
     here = evaluated(start)

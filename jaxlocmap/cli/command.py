@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import os
 import sys
 import threading
@@ -16,6 +17,7 @@ import tyro
 from jaxlocmap.cli import compilation
 from jaxlocmap.cli.console import CONSOLE
 
+_GC = 50_000, 20, 50  # tracing makes many small objects, which are not garbage: a quarter of its time by default
 Program = Callable[[Any], Any]  # of one argument, `config`, whose annotation is a dataclass of settings
 
 
@@ -39,6 +41,7 @@ def command_line(
         name, description: as the help has them; by default the file's name and its docstring.
     """
     options, program = _parsed(programs, name, description)
+    gc.set_threshold(*_GC)
     try:
         if options.cache:
             compilation.keep_on_disk()

@@ -17,6 +17,7 @@ from pathlib import Path
 import jax
 import platformdirs
 
+_CPUINFO = Path("/proc/cpuinfo")  # where the system has one
 _MOST_BYTES = 2**30  # of a folder; what was used longest ago goes first
 _COMPILED, _KEPT = "/jax/core/compile/backend_compile_duration", "/jax/compilation_cache/cache_hits"
 _PHASES = {
@@ -52,7 +53,7 @@ def folder_in_use() -> str | None:
 def _processor() -> str:
     """A name for the instructions of this machine's processor."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = _CPUINFO.read_text().splitlines()
     except OSError:
         lines = [platform.processor()]
     told = {line for line in lines if line.startswith(("flags", "Features", "model name"))} or set(lines[:1])
@@ -64,8 +65,8 @@ class Spent:
 
     def __init__(self) -> None:
         self._spans: dict[str, list[tuple[float, float]]] = {phase: [] for phase in _PHASES.values()}
-        self.programs = 0
-        self.kept = 0  # of them, compiled by an earlier start
+        self.programs: int = 0
+        self.kept: int = 0  # of them, compiled by an earlier start
 
     def on_span(self, event: str, start_time: float, end_time: float, **kwargs: str | int) -> None:
         """Called by JAX; a span that lies in another, as of a function called while tracing, is part of it."""

@@ -19,7 +19,9 @@ from rich.table import Table
 from jaxlocmap import files
 
 # A path or a name may hold what looks like markup.
-CONSOLE = Console(width=min(100, Console().width) if sys.stdout.isatty() else 100, markup=False, highlight=False)
+CONSOLE: Console = Console(
+    width=min(100, Console().width) if sys.stdout.isatty() else 100, markup=False, highlight=False
+)
 
 
 def output_folder(path: Path) -> Path:

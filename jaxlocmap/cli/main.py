@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from jaxlocmap.cli import graph, judge, localize, map_log, slam, study, sweep, tune
-from jaxlocmap.cli.command import command_line
+from jaxlocmap.cli.command import Program, command_line
 
-JOBS = {
+JOBS: dict[str, Program] = {
     "study": study.main,
     "sweep": sweep.main,
     "tune": tune.main,

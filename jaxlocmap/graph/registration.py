@@ -101,14 +101,17 @@ def register(
     )
 
 
+Placed = tuple[np.ndarray, np.ndarray]  # numbers of scans (n,), where they lie in the submap (n, 3) m, m, rad
+
+
 class SubmapScans:
     """Which scans are in each submap of a trail, where they lie, and how well that is known."""
 
     def __init__(self, trail: Trail) -> None:
         n = trail.submaps
         own = [np.flatnonzero(trail.drawn & (trail.submap == k)) for k in range(n)]
-        self.matched = [(scans, trail.place[scans]) for scans in own]  # those matched on the submap
-        self.drawn = []  # these and the ones before them, matched on the submap before
+        self.matched: list[Placed] = [(scans, trail.place[scans]) for scans in own]  # those matched on the submap
+        self.drawn: list[Placed] = []  # these and the ones before them, matched on the submap before
         for k, (scans, places) in enumerate(self.matched):
             early = np.arange(trail.begun[k], scans[0] if len(scans) else trail.begun[k])
             early = early[trail.drawn[early] & (trail.submap[early] == k - 1)]
@@ -121,8 +124,12 @@ class SubmapScans:
             self.drawn.append((scans, places))
         none = np.zeros((1, POSE)), np.zeros((1, POSE, POSE))
         # (N, 3, 3) covariance of a scan's place: an average over those of the submap.
-        self.spread = np.stack([(trail.place_cov[scans] if len(scans) else none[1]).mean(axis=0) for scans in own])
-        self.middle = np.stack([(trail.place[scans] if len(scans) else none[0]).mean(axis=0) for scans in own])
+        self.spread: np.ndarray = np.stack(
+            [(trail.place_cov[scans] if len(scans) else none[1]).mean(axis=0) for scans in own]
+        )
+        self.middle: np.ndarray = np.stack(
+            [(trail.place[scans] if len(scans) else none[0]).mean(axis=0) for scans in own]
+        )
         self._most = [
             -(-max(len(scans) for scans, _ in part) // many) * many
             for part, many in zip((self.matched, self.drawn), _MANY, strict=True)

@@ -56,9 +56,12 @@ class Checkpoint:
             discard: start anew where there are any.
             say: called with a sentence on what is found, discarded or damaged.
         """
-        self.folder, self.settings, self.say = Path(folder) / _FOLDER, dict(settings or {}), say
-        self.resume, self.discard = resume, discard
-        self.runs_kept = 0  # in this process's parts
+        self.folder: Path = Path(folder) / _FOLDER
+        self.settings: dict[str, Any] = dict(settings or {})
+        self.say: Callable[[str], None] = say
+        self.resume: bool = resume
+        self.discard: bool = discard
+        self.runs_kept: int = 0  # in this process's parts
         self._manifest: dict[str, Any] = {}
         self._lock: Lock | None = None
         self._synced, self._unsynced = -math.inf, list[Path]()

@@ -45,6 +45,7 @@ batch.py            what it is tuned on: sequences, padding, windows
 filtering.py        the filter over all of them
 parameters.py       coordinates in which nothing invalid exists
 forward.py          derivatives by few numbers through long loops
+slopes.py           the objective and its gradient, and what every sequence has in them
 fit.py              the descent
 standard_errors.py  standard errors, correlations, and what the data cannot tell
 """

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import simulation
+from jaxlocmap.parameters import Params
 from jaxlocmap.simulation.world import World
 from jaxlocmap.types import Gaussian, Inputs
 
@@ -239,3 +240,9 @@ def _filled(batch: Batch, steps: int, slots: int) -> Batch:
     return batch._replace(
         inputs=inputs, **{name: None if x is None else fill(x, {1: later}) for name, x in by_step.items()}
     )
+
+
+def in_dtype_of(batch: Batch, params: Params) -> Params:
+    """The same parameters in the dtype of the batch, so that programs compiled for some fit the others."""
+    dtype = jnp.asarray(batch.prior.mean).dtype
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), params)

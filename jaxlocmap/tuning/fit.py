@@ -14,10 +14,11 @@ import numpy as np
 import optax
 
 from jaxlocmap.parameters import Block, Params
-from jaxlocmap.tuning.batch import Batch, pick
+from jaxlocmap.tuning.batch import Batch, in_dtype_of, pick
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.losses import Objective
 from jaxlocmap.tuning.parameters import NOISE, Coordinates, constrain, correlations_of, natural, unconstrain
+from jaxlocmap.tuning.slopes import Evaluation, evaluate, params_at
 
 _LBFGS = optax.scale_by_lbfgs()  # the direction alone
 _ADAM = optax.adam(0.05)
@@ -46,20 +47,6 @@ class Fit(NamedTuple):
     stopped_early: bool
     compile_s: float  # until the loss at the start is known: compilation, if there was any, and one evaluation
     run_s: float  # of the descent
-
-
-class Evaluation(NamedTuple):
-    """The objective at some coordinates."""
-
-    loss: Any  # ()
-    gradient: Any  # by coordinate, () each
-    sums: Any  # of `Objective.tallies`
-    accepted: Any
-
-    @property
-    def finite(self) -> bool:
-        """Whether loss and gradient are."""
-        return bool(np.isfinite([self.loss, *self.gradient.values()]).all())
 
 
 def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str, ...]) -> Callable[..., Any]:
@@ -103,7 +90,7 @@ def _of_coordinates(objective: Objective) -> Callable[..., Any]:
 
     def f(coordinates: Coordinates, data: tuple[Params, Batch]) -> Any:
         params, batch = data
-        sums, accepted = objective.tallies(_params_at(objective.blocks, coordinates, params, batch), batch)
+        sums, accepted = objective.tallies(params_at(objective.blocks, coordinates, params, batch), batch)
         total, terms = objective.value(jax.tree.map(jnp.sum, sums))
         let_in = None if accepted is None else accepted.astype(total.dtype)  # integers have no derivative
         return total, terms, sums, let_in
@@ -111,29 +98,12 @@ def _of_coordinates(objective: Objective) -> Callable[..., Any]:
     return forward(f)
 
 
-def _params_at(blocks: tuple[Block, ...], coordinates: Coordinates, params: Params, batch: Batch) -> Params:
-    """The parameters at some coordinates, in the dtype of the batch."""
-    dtype = jnp.asarray(batch.prior.mean).dtype
-    whole = {name: jnp.asarray(value, dtype) for name, value in unconstrain(params, blocks).items()}
-    return constrain(whole | coordinates, blocks, others=params)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _evaluated(objective: Objective, coordinates: Coordinates, params: Params, batch: Batch) -> Evaluation:
-    def f(coordinates: Coordinates) -> tuple[jax.Array, Any]:
-        total, _, sums, accepted = _of_coordinates(objective)(coordinates, (params, batch))
-        return total, (sums, accepted)
-
-    (loss, (sums, accepted)), gradient = jax.value_and_grad(f, has_aux=True)(coordinates)
-    return Evaluation(loss, gradient, sums, accepted)
-
-
 @functools.partial(jax.jit, static_argnums=0)
 def _named(
     blocks: tuple[Block, ...], coordinates: Coordinates, params: Params, batch: Batch
 ) -> tuple[Params, dict[str, jax.Array]]:
     """The parameters at some coordinates, and what people call them."""
-    at = _params_at(blocks, coordinates, params, batch)
+    at = params_at(blocks, coordinates, params, batch)
     return at, natural(at, blocks)
 
 
@@ -188,15 +158,14 @@ def fit(
         raise ValueError(f"minibatch: expected a key and 1 to {runs} sequences, got key {key} and {minibatch}")
     _check_coordinates(objective, params, tuned)
     began = time.perf_counter()
-    blocks = objective.blocks
-    dtype = jnp.asarray(batch.prior.mean).dtype
-    theta = {name: jnp.asarray(unconstrain(params, blocks)[name], dtype) for name in tuned}
+    blocks, params = objective.blocks, in_dtype_of(batch, params)
+    theta = {name: value for name, value in unconstrain(params, blocks).items() if name in tuned}
     evaluations = 0
 
     def evaluated(theta: Coordinates, some: Batch = batch) -> Evaluation:
         nonlocal evaluations
         evaluations += 1
-        return jax.tree.map(np.asarray, _evaluated(objective, theta, params, some))
+        return evaluate(objective, theta, params, some)
 
     def params_at(theta: Coordinates) -> Params:
         return _named(blocks, theta, params, batch)[0]

@@ -27,7 +27,7 @@ from jaxlocmap.mapping.predictive import PredictiveScore, predict_scans
 from jaxlocmap.parameters import Block, Params
 from jaxlocmap.se2 import POSE
 from jaxlocmap.sensors import Sensor
-from jaxlocmap.tuning.batch import Batch
+from jaxlocmap.tuning.batch import Batch, in_dtype_of
 from jaxlocmap.tuning.filtering import Judged, check_batch, filtered
 from jaxlocmap.tuning.forward import forward
 from jaxlocmap.tuning.parameters import SENSOR_MODEL, blocks_of, check_names
@@ -259,7 +259,7 @@ class Objective:
 
     def judged(self, params: Params, batch: Batch) -> tuple[float, dict[str, float]]:
         """What a call returns, as numbers: compiled once for every shape of the batch."""
-        total, terms = self.value(jax.tree.map(jnp.sum, _tallied(self, params, batch)[0]))
+        total, terms = self.value(jax.tree.map(jnp.sum, _tallied(self, in_dtype_of(batch, params), batch)[0]))
         return float(total), {name: float(term) for name, term in terms.items()}
 
     def check_tuned(self, tuned: tuple[str, ...]) -> None:
@@ -288,7 +288,7 @@ class Objective:
             ValueError: as these.
         """
         self.check_batch(batch)
-        self.check_start(batch, *_tallied(self, params, batch))
+        self.check_start(batch, *_tallied(self, in_dtype_of(batch, params), batch))
 
     def check_batch(self, batch: Batch) -> None:
         """Raise if there is nothing to tune on.
