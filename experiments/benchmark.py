@@ -72,7 +72,7 @@ class Size(NamedTuple):
     imports: int = 5
 
 
-QUICK = Size(1, 0.0, 4000, 20, 50, ("float64",), (200, 2000), 1)
+QUICK = Size(1, 0.0, 2000, 20, 50, ("float64",), (200, 2000), 1)
 _TICKS: dict[str, Callable[[Size], int]] = {
     "study": lambda size: 3,
     "filter": lambda size: len(size.precisions) * len(peers.PEERS),
