@@ -3,13 +3,14 @@
 import importlib
 import importlib.util
 import re
+import runpy
 import subprocess
 import sys
 from types import SimpleNamespace
 
 import jax
 import pytest
-from programs import ON_CPU, WALKS, ended, start
+from programs import ON_CPU, ROOT, WALKS, ended, start
 
 from jaxlocmap import plotting
 from jaxlocmap.cli import command, compilation
@@ -54,6 +55,16 @@ def test_a_shell_can_complete_it(capsys, monkeypatch, shell):
     status, said = said_by(capsys, monkeypatch, "--tyro-print-completion", shell)
     assert status in (0, None)
     assert all(job in said for job in JOBS)
+
+
+@pytest.mark.parametrize(
+    ("former", "job"), [("consistency", "study"), ("localize", "localize"), ("map_log", "map"), ("tune", "tune")]
+)
+def test_a_former_name_is_the_job(capsys, monkeypatch, former, job):
+    monkeypatch.setattr(sys, "argv", [f"{former}.py", "--help"])
+    with pytest.raises(SystemExit):
+        runpy.run_path(str(ROOT / "experiments" / f"{former}.py"), run_name="__main__")
+    assert f"usage: jaxlocmap {job} " in capsys.readouterr().out
 
 
 def test_an_error_is_one_line_unless_more_is_asked_for(capsys, monkeypatch, tmp_path):
