@@ -38,4 +38,4 @@ def _evaluate_records(module: object) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "out/api"))

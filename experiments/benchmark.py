@@ -52,7 +52,7 @@ class BenchmarkConfig:
     seed: int = 0
     """Of all randomness."""
     write: bool = False
-    """Put the tables into the README as well."""
+    """Put the tables into experiments/README.md as well."""
     out: Path = Path("out/benchmark")
     """Folder for report.json and tables.md."""
     quick: bool = False

@@ -44,7 +44,7 @@ class GraphCompareConfig:
     graphs: int = 1000
     """Simulated graphs of 100 poses and 10 loops."""
     write: bool = False
-    """Put the table into the README."""
+    """Put the table into experiments/README.md."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/graph_compare")

@@ -40,7 +40,7 @@ class GraphStudyConfig:
     false: tuple[int, ...] = (0, 2, 10)
     """How many more are false; a study for each."""
     write: bool = False
-    """Put the table into the README."""
+    """Put the table into experiments/README.md."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/graph_study")

@@ -1,4 +1,4 @@
-"""The former name of `jaxlocmap localize`, by which other programs call it."""
+"""The former name of `jaxlocmap localize`."""
 
 import sys
 

@@ -35,7 +35,7 @@ class MatchingConfig:
     runs: int = 50
     """Simulated runs of either world."""
     write: bool = False
-    """Put the table into the README."""
+    """Put the table into experiments/README.md."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/matching_compare")

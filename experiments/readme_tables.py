@@ -1,4 +1,4 @@
-"""Run every study and log that the README's tables show, and print those tables, or write them into the README."""
+"""Run the studies and logs behind tables of both README files; print those tables, or write them into the files."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class TablesConfig:
     match_runs: int = 200
     """Runs of each study of a filter that matches scans."""
     write: bool = False
-    """Put the tables into the README instead of printing them."""
+    """Put the tables into their pages instead of printing them."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/readme_tables")

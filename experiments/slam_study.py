@@ -57,7 +57,7 @@ class SlamStudyConfig:
     tune: bool = False
     """Find by gradient the two scales at which the true anchors are most likely; judge them on the other world."""
     write: bool = False
-    """Put the table into the README."""
+    """Put the table into experiments/README.md."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/slam_study")

@@ -41,7 +41,7 @@ class SubmapGridsConfig:
     match_every: int = 5
     """Steps between two scans."""
     write: bool = False
-    """Put the table into the README."""
+    """Put the table into experiments/README.md."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/submap_grids")

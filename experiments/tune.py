@@ -1,4 +1,4 @@
-"""The former name of `jaxlocmap tune`, by which other programs call it."""
+"""The former name of `jaxlocmap tune`."""
 
 import sys
 

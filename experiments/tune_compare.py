@@ -51,7 +51,7 @@ class CompareConfig:
     judge_runs: int = 2000
     """Fresh runs to judge by."""
     write: bool = False
-    """Put the tables into the README."""
+    """Put the tables into experiments/README.md."""
     seed: int = 0
     """Of all randomness."""
     out: Path = Path("out/tune_compare")

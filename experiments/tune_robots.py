@@ -1,4 +1,4 @@
-"""Real robots, tuned on one part of a log and judged on another, by loss: the README's table.
+"""Real robots, tuned on one part of a log and judged on another, by loss: a table of experiments/README.md.
 
 Innovations alone do not cure errors that are correlated in time; the truth does. On mrclam every choice of three of the
 five robots is tuned on and the other two are judged.
@@ -39,7 +39,7 @@ class RobotsConfig:
     splits: int = 10
     """How many of the ten ways to split the robots of mrclam."""
     write: bool = False
-    """Put the table into the README."""
+    """Put the table into experiments/README.md."""
     seed: int = 0
     """Nothing here is random; every program has it."""
     out: Path = Path("out/tune_robots")

@@ -8,6 +8,8 @@ def main() -> None:
     try:
         from jaxlocmap.cli import main as cli
     except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("jaxlocmap"):
+            raise
         sys.exit(f"error: {error.name} is not installed: expected pip install 'jaxlocmap[cli]'")
     cli.main()
 

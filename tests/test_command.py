@@ -6,6 +6,7 @@ import re
 import runpy
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -57,6 +58,12 @@ def test_a_shell_can_complete_it(capsys, monkeypatch, shell):
     assert all(job in said for job in JOBS)
 
 
+def test_the_help_of_a_job_says_all_that_its_module_does(capsys, monkeypatch):
+    assert "--no-closure" in said_by(capsys, monkeypatch, "slam", "--help")[1].partition("options")[0]
+    assert "what the gate buys" not in " ".join(said_by(capsys, monkeypatch, "--help")[1].split())
+    assert "what the gate buys" in " ".join(said_by(capsys, monkeypatch, "sweep", "--help")[1].split())
+
+
 @pytest.mark.parametrize(
     ("former", "job"), [("consistency", "study"), ("localize", "localize"), ("map_log", "map"), ("tune", "tune")]
 )
@@ -105,24 +112,36 @@ def test_the_library_needs_no_matplotlib_but_for_figures(monkeypatch):
 # --- Compiled programs
 
 
+def walks(tmp_path, *arguments, **where):
+    """How many programs a start found compiled, of how many, and what it said."""
+    status, said, err = ended(start(WALKS, "--out", tmp_path, "--discard", *arguments, **where))
+    assert status == 0, err
+    counted = re.search(r"(\d+) of (\d+) programs for the processor were compiled before", said)
+    return (*map(int, counted.groups()), said) if counted else (0, 0, said)
+
+
 def test_a_second_start_compiles_nothing(tmp_path):
-    """And a damaged entry is compiled anew."""
-    here = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
-
-    def found():
-        status, said, err = ended(start(WALKS, "--out", tmp_path, "--discard", **here))
-        assert status == 0, err
-        kept, programs = re.search(r"(\d+) of (\d+) programs were found", said).groups()
-        assert f"in {tmp_path / 'cache'}" in said
-        return int(kept), int(programs)
-
-    kept, programs = found()
+    """Nor does the one after a start that was killed while it wrote a program."""
+    where = {"JAX_COMPILATION_CACHE_DIR": "", "XDG_CACHE_HOME": str(tmp_path)}
+    kept, programs, said = walks(tmp_path, **where)
     assert kept < programs
-    assert found() == (programs, programs)
-    largest = max((tmp_path / "cache").glob("*-cache"), key=lambda file: file.stat().st_size)
+    (folder,) = (tmp_path / "jaxlocmap").iterdir()
+    assert str(folder) in said
+    assert walks(tmp_path, **where)[:2] == (programs, programs)
+    largest = max(folder.glob("*-cache"), key=lambda file: file.stat().st_size)
     largest.write_bytes(largest.read_bytes()[:100])
-    kept, programs = found()
-    assert kept == programs - 1
+    largest.with_name(largest.name.replace("-cache", "-atime")).unlink()
+    assert walks(tmp_path, **where)[:2] == (programs - 1, programs)
+    assert walks(tmp_path, **where)[:2] == (programs, programs)
+
+
+def test_a_folder_of_the_user_s_is_used_unless_told_not_to(tmp_path):
+    where = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "mine")}
+    assert str(tmp_path / "mine") in walks(tmp_path, **where)[2]
+    files = sorted((tmp_path / "mine").iterdir())
+    assert files
+    assert "compiled before" not in walks(tmp_path, "--no-cache", "--seed", 5, **where)[2]
+    assert sorted((tmp_path / "mine").iterdir()) == files
 
 
 @pytest.fixture
@@ -140,7 +159,7 @@ def test_programs_are_kept_by_jax_and_processor(monkeypatch, settings, tmp_path)
     first = settings["jax_compilation_cache_dir"]
     assert first.startswith(str(tmp_path / "jaxlocmap" / f"jax-{jax.__version__}-"))
     assert settings["jax_persistent_cache_min_compile_time_secs"] == 0
-    assert settings["jax_compilation_cache_max_size"] == 2**30
+    assert settings["jax_compilation_cache_max_size"] == 2**28
     other = tmp_path / "cpuinfo"
     other.write_text("model name : another\nflags : none\nbogomips : 1\n")
     monkeypatch.setattr(compilation, "_CPUINFO", other)
@@ -153,9 +172,13 @@ def test_programs_are_kept_by_jax_and_processor(monkeypatch, settings, tmp_path)
     assert settings["jax_compilation_cache_dir"] == second != first
 
 
-def test_a_folder_that_cannot_be_made_is_no_error(monkeypatch, settings, tmp_path):
-    (tmp_path / "file").write_text("")
-    monkeypatch.setattr(compilation.platformdirs, "user_cache_path", lambda name: tmp_path / "file" / name)
+def homeless(name):
+    raise RuntimeError("Could not determine home directory.")
+
+
+@pytest.mark.parametrize("where", [lambda name: Path(__file__) / name, homeless], ids=["a file", "no home"])
+def test_a_folder_that_cannot_be_made_is_no_error(monkeypatch, settings, where):
+    monkeypatch.setattr(compilation.platformdirs, "user_cache_path", where)
     compilation.keep_on_disk()
     assert "jax_compilation_cache_dir" not in settings
 

@@ -108,7 +108,7 @@ CONSISTENCY = (
     ],
     ids=str,
 )
-def test_options_of_consistency(monkeypatch, tmp_path, options, fields):
+def test_options_of_a_study(monkeypatch, tmp_path, options, fields):
     config = study_program.StudyConfig(**options, out=tmp_path, compute=ComputeConfig(chunk=3))
     (study, key, runs, params, world, noise, prior), named = handed_to_the_study(monkeypatch, study_program, config)
     expected = {"name": "capstone", "exact": True, "motion": "arc", "runs": 2000, "gate": 0.99, "map": True, "seed": 0}
@@ -149,13 +149,13 @@ def test_noise_that_is_none_is_refused(tmp_path, options):
         study_program.main(study_program.StudyConfig(**options, out=tmp_path))
 
 
-def test_parameters_of_consistency(monkeypatch, tmp_path, plant):
+def test_parameters_of_a_study(monkeypatch, tmp_path, plant):
     config = study_program.StudyConfig(params=plant[0], out=tmp_path)
     given, _ = handed_to_the_study(monkeypatch, study_program, config)
     np.testing.assert_allclose(given[3].Q, plant[1].Q, rtol=1e-6)
 
 
-def test_the_report_of_consistency(monkeypatch, tmp_path, plant):
+def test_the_report_of_a_study(monkeypatch, tmp_path, plant):
     """What was summed is judged beside the reference; the picture is of this study's filter."""
     for name in ("start", "study_checkpoint", "finish", "_print"):
         monkeypatch.setattr(study_program, name, Recorder())

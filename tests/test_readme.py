@@ -24,7 +24,7 @@ def examples():
 
 def test_there_are_examples():
     pages = [page for page, _ in examples()]
-    assert pages.count("README.md") == 2
+    assert pages.count("README.md") == 3
     packages = ("consistency", "graph", "matching", "tuning")
     assert set(pages) == {
         "README.md",

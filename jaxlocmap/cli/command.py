@@ -7,6 +7,7 @@ import gc
 import os
 import sys
 import threading
+import traceback
 import typing
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, NoReturn
@@ -43,14 +44,13 @@ def command_line(
     options, program = _parsed(programs, name, description)
     gc.set_threshold(*_GC)
     try:
-        if options.cache:
-            compilation.keep_on_disk()
+        compilation.keep_on_disk(options.cache)
         with compilation.watched() as spent:
             program()
         CONSOLE.print(spent.words(), soft_wrap=True)
     except (ValueError, TypeError, OverflowError, OSError) as error:
         if options.traceback:
-            CONSOLE.print_exception()
+            traceback.print_exc()
         _leave(1, f"error: {error}")
     except KeyboardInterrupt as stop:
         _leave(130, "; ".join(["stopped", *map(str, stop.args)]))
@@ -65,13 +65,21 @@ def _parsed(
         wanted: Any = settings_of(programs)
         description = description or sys.modules[programs.__module__].__doc__
     else:
-        words = tuple(Annotated[settings_of(p), tyro.conf.subcommand(word)] for word, p in programs.items())
+        words = tuple(
+            Annotated[settings_of(p), tyro.conf.subcommand(word, description=_description(word, p))]
+            for word, p in programs.items()
+        )
         wanted = typing.Union[words]  # noqa: UP007 of as many as there are
     common = ("common", Annotated[Common, tyro.conf.arg(name="")], dataclasses.field(default_factory=Common))
     command = dataclasses.make_dataclass("Command", [("settings", wanted), common])
     markers = (tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes, tyro.conf.OmitArgPrefixes)
     parsed: Any = tyro.cli(command, prog=name, description=description, config=markers)
     return parsed.common, lambda: by_settings[type(parsed.settings)](parsed.settings)
+
+
+def _description(word: str, program: Program) -> str | None:
+    """A line among others; of the job that is asked for, all that its module says."""
+    return sys.modules[program.__module__].__doc__ if word in sys.argv else settings_of(program).__doc__
 
 
 def settings_of(program: Program) -> type:

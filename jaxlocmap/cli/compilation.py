@@ -2,23 +2,24 @@
 
 JAX looks a program up by its code, its options, the version of the compiler and the devices; that of a CPU says nothing
 of its instructions, so each kind of processor has a folder of its own here. An entry that cannot be read is compiled
-anew. See jax.dev, "Persistent compilation cache".
+anew, and JAX warns of it. Of several processes that share the work the first one writes. See docs.jax.dev, "Persistent
+compilation cache".
 """
 
 from __future__ import annotations
 
 import hashlib
 import platform
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import filelock
 import jax
 import platformdirs
 
 _CPUINFO = Path("/proc/cpuinfo")  # where the system has one
-_MOST_BYTES = 2**30  # of a folder; what was used longest ago goes first
+_MOST_BYTES = 2**28  # of a folder; what was used longest ago goes first
 _COMPILED, _KEPT = "/jax/core/compile/backend_compile_duration", "/jax/compilation_cache/cache_hits"
 _PHASES = {
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
@@ -27,27 +28,47 @@ _PHASES = {
 }
 
 
-def keep_on_disk() -> None:
+def keep_on_disk(keep: bool = True) -> None:
     """Have JAX keep every program it compiles, in the user's cache folder or where JAX_COMPILATION_CACHE_DIR says.
 
-    A folder that cannot be written is no error: then each start compiles.
+    A folder that cannot be found or written is no error: then each start compiles.
+
+    Args:
+        keep: or not to use what is kept there either.
     """
-    if folder_in_use() is None:
-        folder = platformdirs.user_cache_path("jaxlocmap") / f"jax-{jax.__version__}-{_processor()}"
+    jax.config.update("jax_enable_compilation_cache", keep)
+    if not keep:
+        return
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    if not folder_in_use():
         try:
+            folder = platformdirs.user_cache_path("jaxlocmap") / f"jax-{jax.__version__}-{_processor()}"
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
+            _clear_what_was_not_finished(folder)
+        except (OSError, RuntimeError):  # the latter where the system knows no home
             return
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_compilation_cache_max_size", _MOST_BYTES)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    # JAX warns of an entry that it cannot read or write, and compiles.
-    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache entry")
+
+
+def _clear_what_was_not_finished(folder: Path) -> None:
+    """Delete entries of starts that ended while they wrote one. JAX writes a program and then when it was used; what
+    lacks either may be cut short, and stops JAX from keeping more.
+
+    Raises:
+        OSError: the folder cannot be written, or somebody holds its lock.
+    """
+    with filelock.FileLock(folder / ".lockfile", timeout=1):  # the one JAX takes
+        for last, other in (("-cache", "-atime"), ("-atime", "-cache")):
+            for file in folder.glob(f"*{last}"):
+                if not file.with_name(file.name.removesuffix(last) + other).exists():
+                    file.unlink()
 
 
 def folder_in_use() -> str | None:
     """Where compiled programs are kept, if they are."""
-    return jax.config.values["jax_compilation_cache_dir"]
+    values = jax.config.values
+    return values["jax_compilation_cache_dir"] if values["jax_enable_compilation_cache"] else None
 
 
 def _processor() -> str:
@@ -89,8 +110,10 @@ class Spent:
         """A sentence."""
         seconds = ", ".join(f"{phase} {value:.1f} s" for phase, value in self.seconds().items())
         cache = folder_in_use()
-        where = f"in {cache} from earlier starts (--no-cache compiles anew)" if cache else "on disk"
-        return f"{seconds}; {self.kept} of {self.programs} programs were found {where}"
+        if not cache:
+            return seconds
+        kept = f"{self.kept} of {self.programs} programs for the processor were compiled before"
+        return f"{seconds}; {kept}, in {cache} (--no-cache compiles anew)"
 
 
 @contextmanager

@@ -1,4 +1,8 @@
-"""Localise a robot on its log, and judge the filter against the truth where the log has one."""
+"""Localise a robot among landmarks on its log, and judge the filter against the truth where the log has one.
+
+Writes the trajectory with its ellipses, the NEES, and estimate.tum and truth.tum, which `evo_ape tum` compares. --smooth
+corrects every pose by what came after, backwards over the whole log, and writes smoothed.csv.
+"""
 
 from __future__ import annotations
 

@@ -145,6 +145,10 @@ def judged_cell(totals: Totals, settings: Config) -> dict[str, Any]:
 def verdict(x: str, y: str, cells: list[dict[str, Any]]) -> str:
     """How many cells are consistent, and which one fits best. Many combinations of Q and R have an ANEES of 3; the
     NIS tells them apart.
+
+    Args:
+        x, y: what was swept, names in `SWEPT`.
+        cells: as `judged_cell` reports them, each with its values of x and y.
     """
     count = sum(cell["consistent"] for cell in cells)
     best = min(cells, key=lambda cell: (not cell["consistent"], cell["misfit"]))
@@ -170,7 +174,13 @@ def _rmse(cell: dict[str, Any]) -> float:
 
 
 def gate_verdict(other: str, rows: list[dict[str, Any]], runs: int) -> str:
-    """Where the gate buys most accuracy, in words."""
+    """Where the gate buys most accuracy, in words.
+
+    Args:
+        other: what was swept beside the gate.
+        rows: of `what_the_gate_buys`.
+        runs: in each cell.
+    """
     compared = [row for row in rows if row["without"] is not None]
     if not compared:
         return "no gate, which is gate 1, was not swept: nothing to compare with"

@@ -87,7 +87,13 @@ def closed(
 
 
 def surfaces(ranges: np.ndarray, beam_angles: Any, settings: Config) -> Points:
-    """The points of all scans (S, B), (S, B, ...)."""
+    """The points that scans saw, with their normals, (S, B, ...).
+
+    Args:
+        ranges: (S, B) m.
+        beam_angles: (B,) rad.
+        settings: of the filter.
+    """
     matcher = settings.matcher or Matcher()
     scanner = settings.scanner(jnp.asarray(beam_angles, jnp.float32))
     return _surfaces(jnp.asarray(ranges, jnp.float32), scanner, matcher.range_std, matcher.gap)
@@ -99,7 +105,15 @@ def _surfaces(ranges: jax.Array, scanner: Scanner, std: float, gap: float) -> Po
 
 
 def drawn(log: Log, settings: Config, poses: np.ndarray, counts: np.ndarray, half_width: float) -> np.ndarray:
-    """One map of lines of all scans that count, (rows, columns, 6), about the start."""
+    """One map of lines of the scans of a log, (rows, columns, 6), about the start.
+
+    Args:
+        log: S scans.
+        settings: of the filter.
+        poses: (S, 3) m, m, rad.
+        counts: (S,) bool: the scans to draw.
+        half_width: of the map, m.
+    """
     matcher = Matcher(half_width=half_width, resolution=(settings.matcher or Matcher()).resolution)
     points = surfaces(log.scan, log.beam_angles, settings)
 

@@ -68,7 +68,7 @@ def coordinates_objective(objective: Objective, params: Params, tuned: tuple[str
     """
     _check_coordinates(objective, params, tuned)
     of_coordinates = _of_coordinates(objective)
-    return lambda coordinates, batch: of_coordinates(coordinates, (params, batch))[:2]
+    return lambda coordinates, batch: of_coordinates(coordinates, (params, batch))
 
 
 def _check_coordinates(objective: Objective, params: Params, tuned: tuple[str, ...]) -> None:
@@ -86,14 +86,11 @@ def _check_coordinates(objective: Objective, params: Params, tuned: tuple[str, .
 
 @functools.lru_cache(maxsize=16)  # one function for an objective, so that JAX traces it once for the same shapes
 def _of_coordinates(objective: Objective) -> Callable[..., Any]:
-    """`f(coordinates, (params, batch)) -> (total, {loss: ()}, tallies, accepted)`; what has no coordinate stays."""
+    """`f(coordinates, (params, batch)) -> (total, {loss: ()})`; what has no coordinate stays."""
 
     def f(coordinates: Coordinates, data: tuple[Params, Batch]) -> Any:
         params, batch = data
-        sums, accepted = objective.tallies(params_at(objective.blocks, coordinates, params, batch), batch)
-        total, terms = objective.value(jax.tree.map(jnp.sum, sums))
-        let_in = None if accepted is None else accepted.astype(total.dtype)  # integers have no derivative
-        return total, terms, sums, let_in
+        return objective(params_at(objective.blocks, coordinates, params, batch), batch)
 
     return forward(f)
 

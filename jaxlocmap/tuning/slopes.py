@@ -62,6 +62,13 @@ def _evaluated(objective: Objective, coordinates: Coordinates, params: Params, b
 
 
 def params_at(blocks: tuple[Block, ...], coordinates: Coordinates, params: Params, batch: Batch) -> Params:
-    """The parameters at some coordinates, in the dtype of the batch."""
+    """The parameters at some coordinates, in the dtype of the batch.
+
+    Args:
+        blocks: that the filter has.
+        coordinates: of what is tuned, () each.
+        params: the rest.
+        batch: whose dtype counts.
+    """
     whole = unconstrain(in_dtype_of(batch, params), blocks)
     return constrain(whole | coordinates, blocks, others=params)

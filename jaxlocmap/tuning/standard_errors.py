@@ -16,8 +16,10 @@ from jaxlocmap.tuning.batch import Batch, in_dtype_of
 from jaxlocmap.tuning.losses import Objective
 from jaxlocmap.tuning.parameters import BLOCKS, correlations_of, natural, unconstrain
 from jaxlocmap.tuning.slopes import Evaluation, evaluate, params_at
+from jaxlocmap.types import Config
 
 _STEP = 1e-2  # of a coordinate, a logarithm: wide enough for what a gate lets in to change evenly
+_ROUGH = "the gate decides, so the gradient jumps: standard errors are rough, with gate_temperature they are not"
 _VAGUE = 1.0  # a standard error of a coordinate above this is said in words
 _TIED = 0.95  # a correlation above this: only a combination is known
 _FLAT = 1e-4  # of the largest curvature: none
@@ -49,9 +51,9 @@ def standard_errors(objective: Objective, params: Params, batch: Batch, tuned: t
     finds the map that those before it have made.
 
     H is made of differences of exact gradients, a hundredth of a coordinate to either side, by the program that a fit
-    has compiled; of its error, some 1e-4 of it, nothing is seen in a standard error. What a gate refuses and the bounds
-    of a map's log-odds make kinks in the gradient: those in the step are part of H, as they are of how the estimate
-    moves.
+    has compiled; where the gradient is smooth, that is good to some 1e-4 of it. A gate that decides makes the gradient
+    jump at every observation that it comes to refuse: H is then rough, and the words say so; with
+    `Config.gate_temperature` there are no jumps. The bounds of a map's log-odds make kinks, which are part of H.
 
     An interval reaches as many standard errors as Student's t with N - 1 degrees says; along the logarithm, so that no
     standard deviation comes out negative, but for correlations, which it keeps within ±1. From fewer than 20 sequences
@@ -83,7 +85,7 @@ def standard_errors(objective: Objective, params: Params, batch: Batch, tuned: t
 
     hessian = np.stack([(gradient(name, _STEP) - gradient(name, -_STEP)) / (2 * _STEP) for name in tuned])
     estimate, scale = (np.asarray(x, np.float64) for x in _in_units(blocks, tuned, params, batch))
-    return _judge(
+    sure = _judge(
         tuned,
         estimate,
         _in_order(here.gradient, tuned),
@@ -92,6 +94,13 @@ def standard_errors(objective: Objective, params: Params, batch: Batch, tuned: t
         scale,
         blocks,
     )
+    return sure._replace(words=(*sure.words, _ROUGH)) if _jumps(objective.config, here) else sure
+
+
+def _jumps(config: Config, here: Evaluation) -> bool:
+    """Whether the gradient jumps where the gate comes to refuse an observation."""
+    gated = here.accepted is not None and np.any(here.accepted > 0) and config.gate_probability is not None
+    return bool(gated and not config.gate_temperature)
 
 
 def _influence(objective: Objective, here: Evaluation, tuned: tuple[str, ...]) -> np.ndarray:
