@@ -12,7 +12,7 @@ import scipy.optimize
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
 from jax.flatten_util import ravel_pytree
 
-from jaxlocmap import Gaussian, Params, simulation, tuning
+from jaxlocmap import Config, Gaussian, Params, simulation, tuning
 from jaxlocmap.tuning.fit import Evaluation, _line_search
 from jaxlocmap.tuning.parameters import BLOCKS
 
@@ -102,6 +102,7 @@ class Bowl:
     """
 
     blocks = BLOCKS
+    config = Config(gate_probability=None)
 
     def __init__(self, told=()):
         self.told, self.asked, self.traced = list(told), [], 0

@@ -1,7 +1,7 @@
 """Localise a robot among landmarks on its log, and judge the filter against the truth where the log has one.
 
-Writes the trajectory with its ellipses, the NEES, and estimate.tum and truth.tum, which `evo_ape tum` compares. --smooth
-corrects every pose by what came after, backwards over the whole log, and writes smoothed.csv.
+Writes the trajectory with its ellipses, the NEES, and estimate.tum and truth.tum, which `evo_ape tum` compares.
+With --smooth every pose is corrected by what came after, backwards over the whole log, and smoothed.csv written.
 """
 
 from __future__ import annotations
