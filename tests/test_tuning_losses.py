@@ -20,6 +20,11 @@ from jaxlocmap.tuning.losses import LOSSES
 OTHER = Params.from_std(v=0.05, w=0.1, range=0.12, bearing=0.01, l_free=-0.43)  # ten times -0.4 is just l_min
 
 
+def without_scans():
+    batch = drives()
+    return batch._replace(inputs=batch.inputs._replace(ranges=None), beam_angles=None)
+
+
 @jax.jit
 def _reported(params, batch):
     return filtered(params, batch, config=ONLY_POSES, collect=lambda info, _: info)
@@ -101,7 +106,7 @@ def some_of(batch):
     ids=["all that is there", "what is counted and known", "beyond the far quantile"],
 )
 def test_losses_are_their_formulas(params, change, tolerance):
-    batch = change(drives(scans=False))
+    batch = change(without_scans())
     info, truth = reported(params, batch)
     expected = by_hand(info, truth, np.asarray(batch.counted), np.asarray(batch.known))
     assert set(expected) == set(OF_POSES)
@@ -156,7 +161,7 @@ def test_gradients_are_what_differences_give(names, x64):
 
 
 def with_one_false_reading(metres):
-    batch = drives(scans=False)
+    batch = without_scans()
     z = np.array(batch.inputs.z)
     n, k, j = np.argwhere(np.asarray(batch.inputs.valid))[-1]
     z[n, k, j, 0] += metres
@@ -177,7 +182,7 @@ def test_a_refused_observation_pays_what_an_outlier_pays(tolerance):
 
 
 def test_to_refuse_everything_is_no_way_to_win():
-    batch = drives(scans=False)
+    batch = without_scans()
     certain = OWN._replace(Q=OWN.Q * 1e-4, R=OWN.R * 1e-4)  # nothing passes the gate after the first
     for loss in ("innovation_nll", "nis"):
         assert alone(loss, certain, batch) > alone(loss, OWN, batch) + 1
