@@ -31,14 +31,13 @@ ONLY_POSES = SHORT.config(motion="euler", gate_probability=0.9999, grid=False)
 
 
 @functools.cache
-def _simulated(runs, seed):
+def _simulated(runs, seed, scans):
     with jax.ensure_compile_time_eval():  # kept, so no part of whatever is traced when it is first asked for
         return tuning.simulated(
-            jax.random.key(seed), runs, simulation.room(), simulation.Noise(), scenario=SHORT, scans=True
+            jax.random.key(seed), runs, simulation.room(), simulation.Noise(), scenario=SHORT, scans=scans
         )
 
 
 def drives(runs=4, seed=0, scans=True):
-    """A batch of simulated drives."""
-    batch = _simulated(runs, seed)
-    return batch if scans else batch._replace(inputs=batch.inputs._replace(ranges=None), beam_angles=None)
+    """A batch of simulated drives: the same with scans and, in half the time, without."""
+    return _simulated(runs, seed, scans)

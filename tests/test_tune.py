@@ -33,7 +33,8 @@ def tuned(folder, **settings):
 
 
 def test_simulated_drives(tmp_path):
-    report = tuned(tmp_path, motion="euler", tune=("range", "bearing"), optimiser="adam", gate=None)
+    few = {"runs": 8, "judge_runs": 20}  # a NIS of 20 drives is known to some 2 %: before, it is 0.9 where 2 is honest
+    report = tuned(tmp_path, motion="euler", tune=("range", "bearing"), optimiser="adam", gate=None, **few)
     assert set(report["parameters"]) == {"range", "bearing"}
     for value in report["parameters"].values():
         assert {"start", "end", "standard_error", "interval_95", "unit"} == set(value)

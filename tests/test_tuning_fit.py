@@ -41,15 +41,19 @@ def test_it_finds_the_robots_own_noise(x64):
     assert np.all(fit.trace.evaluations >= 1)
 
 
+def blinded(*rows):
+    """Two drives, of which those in these rows see nothing."""
+    batch = jax.tree.map(np.asarray, tuning.pick(drives(scans=False), slice(0, 2)))
+    valid = batch.inputs.valid.copy()
+    valid[list(rows)] = False
+    return batch._replace(inputs=batch.inputs._replace(valid=valid))
+
+
 def test_what_is_kept_skipped_and_left_alone():
     """Of two drives one sees nothing, so that half of the minibatches of one have no loss. Steps are far too long, and
     three epochs that do not help end it.
     """
-    batch = tuning.pick(drives(scans=False), slice(0, 2))
-    valid = np.array(batch.inputs.valid)
-    valid[1] = False
-    batch = batch._replace(inputs=batch.inputs._replace(valid=jnp.asarray(valid)))
-    seen = []
+    batch, seen = blinded(1), []
     fit = tuning.fit(
         OBJECTIVE,
         START,
@@ -303,7 +307,7 @@ def test_two_equations_do_not_tell_three_parameters(losses):
     objective = tuning.Objective(CONFIG, tuple((name, 1.0) for name in losses))
     named = "`, `".join(name for name in losses if name != "map")
     with pytest.raises(ValueError, match=rf"^tuned: the loss `{named}` compares .* two equations.* got v, w, range$"):
-        tuning.fit(objective, START, drives(), tuned=("v", "w", "range", "l_occ"))
+        tuning.fit(objective, START, drives(scans=False), tuned=("v", "w", "range", "l_occ"))
     objective.check_tuned(("v", "range", "l_occ", "l_free"))
 
 
@@ -332,11 +336,11 @@ def test_a_minibatch_needs_a_key_and_runs():
 
 
 def test_the_start_is_checked_first():
-    blind = drives(scans=False)
-    blind = blind._replace(inputs=blind.inputs._replace(valid=blind.inputs.valid & False))
+    """On one drive and two, as `test_what_is_kept_skipped_and_left_alone` has them compiled."""
+    one, blind = tuning.pick(blinded(), slice(0, 1)), blinded(0, 1)
     with pytest.raises(ValueError, match="expected an observation"):
         tuning.fit(OBJECTIVE, START, blind)
     with pytest.raises(ValueError, match="positive definite"):
-        tuning.fit(OBJECTIVE, START._replace(Q=-START.Q), drives(scans=False))
+        tuning.fit(OBJECTIVE, START._replace(Q=-START.Q), one)
     with pytest.raises(ValueError, match="validation: expected a finite loss"):
-        tuning.fit(OBJECTIVE, START, drives(scans=False), validation=blind, optimiser=optax.sgd(1.0))
+        tuning.fit(OBJECTIVE, START, one, tuned=("range",), validation=blind, optimiser=optax.sgd(1.0))
