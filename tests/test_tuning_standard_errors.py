@@ -9,9 +9,9 @@ import pytest
 import scipy.stats
 from drives import ONLY_POSES, OWN, drives
 
-from jaxlocmap import tuning
-from jaxlocmap.tuning.slopes import evaluate
-from jaxlocmap.tuning.standard_errors import _judge
+from jaxlocmap import Config, tuning
+from jaxlocmap.tuning.slopes import Evaluation, evaluate
+from jaxlocmap.tuning.standard_errors import _judge, _jumps
 
 NAMES = ("w", "range")
 
@@ -45,6 +45,7 @@ def test_it_is_the_quadratic_form_of_differences(x64):
     sure = tuning.standard_errors(objective, OWN, batch, tuned)
     assert "l_occ: the loss does not depend on it here" in sure.words
     assert np.isinf(sure.standard_error[2])
+    assert any("the gate decides" in words for words in sure.words)
     np.testing.assert_allclose(sure.hessian[:2, :2], hessian, rtol=1e-3, atol=1e-4 * np.abs(hessian).max())
     inverse = np.linalg.inv(hessian)
     cov = inverse @ influence.T @ influence @ inverse * 4 / 3
@@ -181,3 +182,13 @@ def test_one_sequence_has_nothing_to_compare_with():
         tuning.standard_errors(objective, OWN, drives(scans=False), ())
     with pytest.raises(ValueError, match="two equations"):
         tuning.standard_errors(tuning.Objective(ONLY_POSES, (("nis", 1.0),)), OWN, drives(scans=False), tuning.NOISE)
+
+
+@pytest.mark.parametrize(
+    ("gate", "temperature", "accepted", "rough"),
+    [(0.99, 0.0, [3], True), (None, 0.0, [3], False), (0.99, 2.0, [3], False), (0.99, 0.0, None, False)],
+)
+def test_behind_a_gate_that_decides_the_gradient_jumps(gate, temperature, accepted, rough):
+    """Not of a map at poses that are known, for which no filter is run."""
+    config = Config(gate_probability=gate, gate_temperature=temperature)
+    assert _jumps(config, Evaluation(0.0, {}, {}, {}, accepted and np.array(accepted))) == rough
