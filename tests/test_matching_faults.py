@@ -36,6 +36,7 @@ WALLS = simulation.World(
 @functools.partial(jax.jit, static_argnames="config")
 def filtered(inputs, start, Q, config=CONFIG):
     """Many runs, each with a start that is known and a Q of its own. Of the maps nothing is kept."""
+
     def one(inputs, start, Q):
         state = init(Gaussian(start, jnp.zeros((3, 3))), config=config)
         params = PARAMS._replace(Q=Q)
@@ -171,8 +172,8 @@ FAULTS = {
 
 @pytest.fixture(scope="module")
 def faults():
-    """By name: truth, inputs, state, info and refusals of RUNS runs. One program, fault by fault: all maps at once would
-    not fit the processor's cache.
+    """By name: truth, inputs, state, info and refusals of RUNS runs. One program, fault by fault: all maps at once
+    would not fit the processor's cache.
     """
     made = {}
     for name, (make, start, Q, seen) in FAULTS.items():
