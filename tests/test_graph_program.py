@@ -14,20 +14,29 @@ from jaxlocmap.cli import graph
 from jaxlocmap.logs import read_graph, read_trajectory, write_g2o, write_tum
 from jaxlocmap.poses import between, compose
 
-pytestmark = pytest.mark.usefixtures("as_a_program", "x64")
+pytestmark = pytest.mark.usefixtures("x64")
+POSES, LOOPS = 10, 6
 IDS = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 11])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def as_programs():
+    """`as_a_program`, and for a whole module: what its fixtures compile serves its tests."""
+    with jax.numpy_rank_promotion("allow"), jax.numpy_dtype_promotion("standard"):
+        yield
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A graph of ten poses, fixed at the third, and its truth, in a frame of its own."""
+    if not jax.config.jax_enable_x64:
+        pytest.skip("needs float64, this is the float32 job")
     folder = tmp_path_factory.mktemp("graph")
-    with jax.enable_x64(True):
-        truth, measured = drawn(4, poses=10, loops=6)
-        write_g2o(folder / "a.g2o", measured, np.asarray(pose_graph.dead_reckoning(measured)), IDS, fixed=2)
-        moved = compose(np.broadcast_to([5.0, 6.0, 2.0], truth.shape), truth)
-        write_tum(folder / "truth.tum", IDS.astype(float), moved)
-        report = graph.main(graph.GraphConfig(file=folder / "a.g2o", judge=folder / "truth.tum", out=folder / "out"))
+    truth, measured = drawn(4, poses=POSES, loops=LOOPS)
+    write_g2o(folder / "a.g2o", measured, np.asarray(pose_graph.dead_reckoning(measured)), IDS, fixed=2)
+    moved = compose(np.broadcast_to([5.0, 6.0, 2.0], truth.shape), truth)
+    write_tum(folder / "truth.tum", IDS.astype(float), moved)
+    report = graph.main(graph.GraphConfig(file=folder / "a.g2o", judge=folder / "truth.tum", out=folder / "out"))
     return folder, measured, report
 
 
@@ -70,9 +79,9 @@ def test_files(made):
 
 
 def test_false_loops_are_listed(tmp_path, capsys):
-    _, measured = drawn(2, poses=30, loops=10, false=2)
+    _, measured = drawn(2, poses=POSES, loops=LOOPS, false=2)
     poses = np.asarray(pose_graph.dead_reckoning(measured))
-    write_g2o(tmp_path / "a.g2o", measured, poses, np.arange(30))
+    write_g2o(tmp_path / "a.g2o", measured, poses, np.arange(POSES))
     report = graph.main(graph.GraphConfig(file=tmp_path / "a.g2o", kernel="gnc", out=tmp_path / "out"))
     assert report["start"] == "odometry"
     assert report["loops_down_weighted"] >= 2

@@ -153,8 +153,14 @@ def linear_fit(pose, truth=(0.3, -0.2, 0.1)):
 @pytest.mark.parametrize("sigma", [0.0, 1e-2, 10.0])
 def test_the_scans_own_pose_does_not_depend_on_the_belief(sigma):
     """However strong the belief that the solver weighs the scan against, even one that allows no other pose."""
-    solved = fits.solve(linear_fit, jnp.zeros(3), sigma**2 * jnp.eye(3), 0.03)
-    np.testing.assert_allclose(solved.shift(jnp.zeros(3), jnp.asarray(0.03**2)), [0.3, -0.2, 0.1], rtol=0, atol=1e-3)
+
+    @jax.jit
+    def solve(cov):
+        solved = fits.solve(linear_fit, jnp.zeros(3), cov, 0.03)
+        return solved, solved.shift(jnp.zeros(3), jnp.asarray(0.03**2))
+
+    solved, shift = solve(sigma**2 * jnp.eye(3))
+    np.testing.assert_allclose(shift, [0.3, -0.2, 0.1], rtol=0, atol=1e-3)
     assert (np.abs(solved.pose - np.array([0.3, -0.2, 0.1])).max() < 1e-3) == (sigma == 10)
 
 
@@ -213,17 +219,24 @@ def test_an_optimiser_held_back_by_its_prior_is_sure_of_what_no_scan_told_it(mat
 
 def test_moments_of_a_response_know_no_more_than_their_window(matched):
     """Flat, they are those of points spread evenly over it: 0.63 degrees, whatever the scan. Sharp, those of one."""
-    flat = scan_filters.response_moments(matched, lambda poses: jnp.ones(len(poses)))
+
+    @jax.jit
+    def told(matched):
+        responses = (
+            lambda poses: jnp.ones(len(poses)),
+            lambda poses: jnp.where(jnp.all(poses == 0, axis=1), 0.5, 0.0),
+            lambda poses: 1 - 2 * jnp.abs(poses[:, 0] - poses[:, 1]),  # a ridge along x = y, poorer away from it
+        )
+        return [scan_filters.response_moments(matched, response) for response in responses]
+
+    flat, sharp, ridge = told(matched)
     (reach, shifts), (angle, turns) = scan_filters._SHIFTS, scan_filters._TURNS
     x, y = np.meshgrid(*[np.linspace(-reach, reach, shifts)] * 2)
     expected = np.diag([np.mean(x**2), np.mean(y**2), np.mean(np.linspace(-angle, angle, turns) ** 2)])
     np.testing.assert_allclose(np.linalg.inv(flat.information), expected, rtol=0, atol=1e-6)
     assert np.rad2deg(expected[2, 2] ** 0.5) == pytest.approx(0.632, abs=1e-3)
-    sharp = scan_filters.response_moments(matched, lambda poses: jnp.where(jnp.all(poses == 0, axis=1), 0.5, 0.0))
     least = np.array([0.02**2 / 10, 0.02**2 / 10, (angle / 5) ** 2])
     np.testing.assert_allclose(1 / np.diag(sharp.information), 2 * least, rtol=1e-4)
-    # Of a ridge along x = y, poorer away from it.
-    ridge = scan_filters.response_moments(matched, lambda poses: 1 - 2 * jnp.abs(poses[:, 0] - poses[:, 1]))
     R = np.linalg.inv(ridge.information)
     weight = np.where(np.abs(x - y) < 0.05, 1 - 2 * np.abs(x - y), 0)
     np.testing.assert_allclose(R[0, 1], np.sum(weight * x * y) / weight.sum(), rtol=1e-2)
@@ -240,9 +253,8 @@ PARAMS = with_defaults(simulation.own_params(simulation.Noise(), SCENARIO))
 @functools.cache
 def drive():
     world = simulation.room()._replace(landmarks=jnp.zeros((0, 2)))
-    return simulation.simulate(
-        jax.random.key(0), world, simulation.Noise(), jnp.asarray(SCENARIO.start), scenario=SCENARIO
-    )
+    simulate = jax.jit(functools.partial(simulation.simulate, scenario=SCENARIO))
+    return simulate(jax.random.key(0), world, simulation.Noise(), jnp.asarray(SCENARIO.start))
 
 
 @functools.cache
@@ -262,8 +274,8 @@ def odometry():
 
 def test_odometry_is_the_librarys(tolerance):
     config = dataclasses.replace(CONFIG, matcher=None)
-    prior = init(SCENARIO.prior(), config=config)
-    _, info = run(PARAMS, prior, drive()[1]._replace(ranges=None), config=config)
+    filtered = jax.jit(lambda inputs: run(PARAMS, init(SCENARIO.prior(), config=config), inputs, config=config)[1])
+    info = filtered(drive()[1]._replace(ranges=None))
     np.testing.assert_allclose(odometry().mean, info.belief.mean[::5], rtol=0, atol=tolerance(1e-12, 1e-5))
     np.testing.assert_allclose(odometry().cov, info.belief.cov[::5], rtol=0, atol=tolerance(1e-12, 1e-6))
 

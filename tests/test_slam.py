@@ -20,9 +20,8 @@ from jaxlocmap.matching.storage import load_lines
 from jaxlocmap.matching.submaps import with_defaults
 from jaxlocmap.poses import between as moved
 from jaxlocmap.replay import loops as replay_loops
-from jaxlocmap.replay import scans
+from jaxlocmap.replay import maps, scans
 
-pytestmark = pytest.mark.usefixtures("as_a_program")
 SCANS = 60
 ANGLES = np.deg2rad(np.linspace(-90, 90, 91))
 
@@ -58,6 +57,21 @@ def log_file(folder, name="a.log", scans=slice(None), line="FLASER", jump=0.0):
 
 def since_start(poses):
     return moved(np.broadcast_to(poses[0], poses.shape), poses)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def as_programs():
+    """`as_a_program`, and for a whole module: what its fixtures compile serves its tests. Two pieces of the log, the
+    second of which is filled up by four scans.
+    """
+    with (
+        jax.numpy_rank_promotion("allow"),
+        jax.numpy_dtype_promotion("standard"),
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setattr(scans, "PIECE", 32)
+        patch.setattr(maps, "PIECE", 32)
+        yield
 
 
 def program(out, log, **settings):
@@ -219,13 +233,21 @@ def test_parameters_of_a_file_take_the_place_of_the_odometry(tmp_path, monkeypat
 
 @pytest.fixture(scope="module")
 def made_closed(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("closed")
+    """The folder, the report, and the loops as the program closed them."""
+    folder, kept = tmp_path_factory.mktemp("closed"), []
     log = log_file(folder)
-    return folder, program(folder / "out", log, closure=True, submap_length=2.5, online=True)
+    write_tum(folder / "truth.tum", 10.0 + np.arange(SCANS), drive()[0])
+    closed = replay_loops.closed
+    settings = {"closure": True, "submap_length": 2.5, "online": True, "reference": folder / "truth.tum"}
+    settings["max_range"] = 12.0  # as far as the room is wide; a submap is as wide as that and its length
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(replay_loops, "closed", lambda *args, **how: kept.append(closed(*args, **how)) or kept[-1])
+        report = program(folder / "out", log, **settings)
+    return folder, report, kept[0]
 
 
 def test_closed_loops(made_closed):
-    folder, report = made_closed
+    folder, report, _ = made_closed
     poses = since_start(drive()[0])
     estimate = read_trajectory(folder / "out" / "estimate.tum")
     error = np.hypot(*(estimate.pose - poses)[:, :2].T)
@@ -244,7 +266,7 @@ def test_closed_loops(made_closed):
 
 
 def test_what_closed_loops_write(made_closed):
-    folder, report = made_closed
+    folder, report, _ = made_closed
     out = folder / "out"
     graph = read_graph(out / "graph.g2o")
     assert len(graph.ids) == report["closure"]["submaps"]
@@ -268,20 +290,13 @@ def test_words_on_loops():
     assert "did not converge" in slam_loops.loop_doubts({"closure": said | {"converged": False}})[0]
 
 
-def test_false_loops_are_counted(made_closed, monkeypatch):
+def test_false_loops_are_counted(made_closed):
     """Against the true poses none is false; against poses of which every other half is a metre aside, some are."""
-    folder, _ = made_closed
-    loops = []
-    kept = replay_loops.closed
-    monkeypatch.setattr(replay_loops, "closed", lambda *args, **how: loops.append(kept(*args, **how)) or loops[-1])
-    write_tum(folder / "truth.tum", 10.0 + np.arange(SCANS), drive()[0])
-    report = program(
-        folder / "again", folder / "a.log", closure=True, submap_length=2.5, reference=folder / "truth.tum"
-    )
+    _, report, loops = made_closed
     assert report["closure"]["false_kept"] == 0
     aside = drive()[0] + np.where(np.arange(SCANS) > SCANS / 2, 1.0, 0.0)[:, None] * [1, 0, 0]
-    assert replay_loops.false_loops(loops[0], aside) >= 1
-    assert replay_loops.false_loops(loops[0], np.full((SCANS, 3), np.nan)) == 0
+    assert replay_loops.false_loops(loops, aside) >= 1
+    assert replay_loops.false_loops(loops, np.full((SCANS, 3), np.nan)) == 0
 
 
 def test_poses_at_the_stamps_of_scans():
