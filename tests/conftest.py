@@ -35,6 +35,14 @@ settings.register_profile("repeatable", derandomize=True, deadline=None, databas
 settings.load_profile("repeatable")
 
 
+def pytest_configure(config):
+    """Files go to the workers in the order of their names. By their number of tests, as xdist has it, those that take
+    longest would come last, and one worker would wait for the other.
+    """
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
 @pytest.fixture(scope="module", autouse=True)
 def no_program_outlives_its_module():
     """Compiled programs take memory, and pieces of it: Linux lets a process have 65,530, and beyond it JAX crashes."""
