@@ -27,18 +27,8 @@ from jaxlocmap.types import Matcher
 _REFERENCE_RUNS = 2000, 20_000  # at least and at most
 # What a study can be resumed by.
 _SETTINGS = (
-    *("scenario", "motion", "gate", "start", "map", "seed"),
-    *(
-        "steps",
-        "own_noise",
-        "odometry_noise",
-        "beams",
-        "scan_noise",
-        "exact_prior",
-        "landmarks",
-        "match",
-        "match_every",
-    ),
+    *("scenario", "motion", "gate", "start", "map", "seed", "steps", "own_noise", "odometry_noise", "beams"),
+    *("scan_noise", "exact_prior", "landmarks", "match", "match_every"),
 )
 
 

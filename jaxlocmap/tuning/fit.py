@@ -164,7 +164,7 @@ def fit(
         evaluations += 1
         return evaluate(objective, theta, params, some)
 
-    def params_at(theta: Coordinates) -> Params:
+    def params_of(theta: Coordinates) -> Params:
         return _named(blocks, theta, params, batch)[0]
 
     known: Evaluation | None = None  # at theta, of the whole batch
@@ -178,7 +178,7 @@ def fit(
     def judged() -> float:
         nonlocal known
         if validation is not None or minibatch is not None:
-            return objective.judged(params_at(theta), batch if validation is None else validation)[0]
+            return objective.judged(params_of(theta), batch if validation is None else validation)[0]
         known = evaluated(theta) if known is None else known
         return float(known.loss)
 
@@ -192,7 +192,7 @@ def fit(
     def so_far() -> Fit:
         trace = jax.tree.map(lambda *xs: np.stack(xs), *traces)
         seconds = compiled - began, time.perf_counter() - compiled
-        return Fit(params_at(best), best_loss, np.array(losses), trace, best_epoch, stale >= patience, *seconds)
+        return Fit(params_of(best), best_loss, np.array(losses), trace, best_epoch, stale >= patience, *seconds)
 
     keys = None if key is None else jax.random.split(key, (epochs, steps))
     for epoch in range(epochs):

@@ -39,11 +39,10 @@ def evaluate(objective: Objective, coordinates: Coordinates, params: Params, bat
     Args:
         objective: what for.
         coordinates: of what is tuned, () each.
-        params: the rest, which stays.
+        params: the rest, which stays; in the dtype of the batch, so that one program serves all calls.
         batch: of N sequences.
     """
-    found = _evaluated(objective, coordinates, in_dtype_of(batch, params), batch)
-    return jax.tree.map(np.asarray, found)
+    return jax.tree.map(np.asarray, _evaluated(objective, coordinates, params, batch))
 
 
 @functools.partial(jax.jit, static_argnums=0)

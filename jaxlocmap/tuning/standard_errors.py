@@ -106,8 +106,10 @@ def _jumps(config: Config, here: Evaluation) -> bool:
 def _influence(objective: Objective, here: Evaluation, tuned: tuple[str, ...]) -> np.ndarray:
     """The derivative of the gradient by how much each sequence counts, (N, P)."""
     each = np.stack(jax.tree.leaves(here.sums), axis=1).astype(np.float64)  # (N, K): what sequence n adds to tally k
-    by_tally = jax.tree.leaves(here.slopes, is_leaf=lambda x: isinstance(x, dict) and set(x) == set(tuned))
-    slope = np.stack([np.stack([of[name] for name in tuned], axis=1) for of in by_tally], axis=1).astype(np.float64)
+    of_tally = jax.tree.map(
+        lambda _, slopes: np.stack([slopes[name] for name in tuned], axis=1), here.sums, here.slopes
+    )
+    slope = np.stack(jax.tree.leaves(of_tally), axis=1).astype(np.float64)  # (N, K, P)
     weight, bend = (np.asarray(x, np.float64) for x in _by_tallies(objective, jax.tree.map(np.sum, here.sums)))
     return np.einsum("k,nki->ni", weight, slope) + np.einsum("kl,nl,ki->ni", bend, each, slope.sum(axis=0))
 
