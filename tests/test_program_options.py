@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
@@ -258,30 +259,30 @@ class Mapped(NamedTuple):
 def test_the_picture_is_of_one_run_of_the_same_study(monkeypatch, tmp_path):
     scenario = dataclasses.replace(simulation.LOOP, steps=4)
     settings = scenario.config(motion="euler", gate_probability=0.9)
-    drove = Recorder((SimpleNamespace(pose=np.full((4, 3), 2.0)), {"inputs": np.ones(4)}))
+    told = []
+
+    def drove(key, world, noise, start, *, scenario):
+        told.append(scenario)
+        return SimpleNamespace(pose=jnp.tile(start, (4, 1)) + noise.v), {"seed": jax.random.key_data(key)[1]}
+
+    def ran(params, state, inputs, *, landmarks, beam_angles, config, collect):
+        told.extend([config, beam_angles.shape])
+        mean = jnp.stack([params.R[0, 0], inputs["seed"].astype(landmarks.dtype), landmarks[1, 0]])
+        belief = SimpleNamespace(pose=SimpleNamespace(mean=jnp.tile(mean, (4, 1))))
+        return Mapped(jnp.full((2, 2), 3.0)), collect(state, SimpleNamespace(belief=belief), None)
+
     monkeypatch.setattr(study_program.simulation, "simulate", drove)
-    ran = Recorder((Mapped(np.full((2, 2), 3.0)), np.full((4, 3), 5.0)))
-    monkeypatch.setattr(study_program, "run", lambda params, state, inputs, **how: ran(params.R[0, 0], inputs, **how))
+    monkeypatch.setattr(study_program, "run", ran)
     monkeypatch.setattr(study_program.plotting, "map_figure", figure := Recorder())
-    key = jax.random.key(6)
-    room = simulation.room()
-    noise = simulation.Noise()
-    study_program._picture_of_one_run(
-        tmp_path / "a.png", key, simulation.course_params(), room, noise, scenario, settings
-    )
-    ((given, world, noise, start), how) = drove.calls[0]
-    assert same_key(given, 6)
-    assert (noise, how) == (simulation.Noise(), {"scenario": scenario})
-    np.testing.assert_allclose(start, scenario.start, rtol=1e-6)
-    ((_, inputs), how) = ran.calls[0]
-    assert (set(inputs), how["config"], how["collect"]) == ({"inputs"}, settings, study_program._poses)
-    assert how["beam_angles"].shape == (scenario.beams,)
-    ((path, log_odds, grid, beliefs), how) = figure.calls[0]
-    assert (path, grid) == (tmp_path / "a.png", settings.grid)
-    assert (log_odds.tolist(), beliefs[0].tolist(), how["truth"][0].tolist()) == ([[3, 3], [3, 3]], [5] * 3, [2] * 3)
-    np.testing.assert_array_equal(how["segments"], world.segments)
-    belief = SimpleNamespace(pose=SimpleNamespace(mean="mean"))
-    assert study_program._poses(None, SimpleNamespace(belief=belief), None) == "mean"
+    room, noise, params = simulation.room(), simulation.Noise(), simulation.course_params()
+    arguments = jax.random.key(6), params, room, noise, scenario, settings
+    study_program._picture_of_one_run(tmp_path / "a.png", *arguments)
+    assert told == [scenario, settings, (scenario.beams,)]
+    ((path, log_odds, grid, means), how) = figure.calls[0]
+    assert (path, grid, log_odds.tolist()) == (tmp_path / "a.png", settings.grid, [[3, 3], [3, 3]])
+    np.testing.assert_allclose(how["truth"], [np.asarray(scenario.start) + noise.v] * 4, rtol=1e-6)
+    np.testing.assert_allclose(means, [[params.R[0, 0], 6, room.landmarks[1, 0]]] * 4, rtol=1e-6)
+    np.testing.assert_array_equal(how["segments"], room.segments)
 
 
 def test_what_consistency_shows(monkeypatch):

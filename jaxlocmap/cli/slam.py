@@ -26,7 +26,7 @@ from jaxlocmap.cli.options import in_radians, params_or
 from jaxlocmap.cli.slam_loops import loop_doubts, loop_rows, write_loops
 from jaxlocmap.consistency import readable
 from jaxlocmap.graph.trail import trail_of
-from jaxlocmap.logs import Log, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
+from jaxlocmap.logs import Log, Trajectory, read, read_relations, read_trajectory, relation_errors, revisits, write_tum
 from jaxlocmap.logs.relations import Relations, pairs
 from jaxlocmap.mapping import quality
 from jaxlocmap.mapping.ros import save_map
@@ -105,7 +105,8 @@ def main(config: SlamConfig) -> dict[str, Any]:
     if config.quick:
         log = log.with_scans(slice(scans.PIECE))
     known = None if config.map is None else load_lines(config.map)
-    scored = _scored(config, log)
+    reference = None if config.reference is None else read_trajectory(config.reference)
+    scored = _scored(config, log, reference)
     params = params_or(config.params, scans.believed(config.odometry))
     settings = scans.settings_of(
         log,
@@ -135,9 +136,9 @@ def main(config: SlamConfig) -> dict[str, Any]:
         lines = None if state.submaps is None or known else np.asarray(state.submaps.lines)
     else:
         names += write_loops(out, loops, log, report)
-        if config.reference is not None:
-            reference = scans.at_stamps(read_trajectory(config.reference), log.scan_time)
-            report["closure"]["false_kept"] = replay_loops.false_loops(loops, reference)
+        if reference is not None:
+            there = scans.at_stamps(reference, log.scan_time)
+            report["closure"]["false_kept"] = replay_loops.false_loops(loops, there)
         if config.online:
             write_tum(out / "online.tum", log.scan_time, loops.online)
             names.append("online.tum")
@@ -166,13 +167,12 @@ def _check(config: SlamConfig) -> None:
     in_radians(config.fov)
 
 
-def _scored(config: SlamConfig, log: Log) -> dict[str, Relations]:
+def _scored(config: SlamConfig, log: Log, reference: Trajectory | None) -> dict[str, Relations]:
     """What the trajectory is to be scored by; read before anything is computed."""
     scored = {}
     if config.relations is not None:
         scored["relations"] = read_relations(config.relations)
-    if config.reference is not None:
-        reference = read_trajectory(config.reference)
+    if reference is not None:
         scored["revisits"] = revisits(reference.time, reference.pose)
     for name, relations in scored.items():
         _, _, there = pairs(log.scan_time, relations)

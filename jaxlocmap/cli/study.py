@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from pathlib import Path
@@ -172,31 +173,43 @@ def _picture_of_one_run(
     settings: Any,
 ) -> None:
     """The map and path of one more run of the same study, started at the prior's mean."""
-    prior = scenario.prior()
-    truth, inputs = simulation.simulate(key, world, noise, prior.mean, scenario=scenario)
-    state, beliefs = jax.jit(run, static_argnames=("config", "collect"))(
-        params,
-        init(prior, config=settings),
-        inputs,
-        landmarks=world.landmarks,
-        beam_angles=scenario.beam_angles(),
-        config=settings,
-        collect=_poses,
+    truth, means, log_odds = jax.tree.map(
+        np.asarray, _one_run(key, params, world, noise, scenario=scenario, config=settings)
     )
     plotting.map_figure(
         path,
-        np.asarray(state.log_odds),
+        log_odds,
         settings.grid,
-        np.asarray(beliefs),
-        truth=np.asarray(truth.pose),
+        means,
+        truth=truth,
         segments=np.asarray(world.segments),
         title=f"Map of one run of {scenario.name}, made at the estimated poses",
     )
 
 
-def _poses(state: Any, info: Any, aside: Any) -> jax.Array:
-    del state, aside
-    return info.belief.pose.mean
+@functools.partial(jax.jit, static_argnames=("scenario", "config"))
+def _one_run(
+    key: jax.Array,
+    params: Params,
+    world: World,
+    noise: simulation.Noise,
+    *,
+    scenario: simulation.Scenario,
+    config: Config,
+) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """True poses, estimated poses and the map."""
+    prior = scenario.prior()
+    truth, inputs = simulation.simulate(key, world, noise, prior.mean, scenario=scenario)
+    state, means = run(
+        params,
+        init(prior, config=config),
+        inputs,
+        landmarks=world.landmarks,
+        beam_angles=scenario.beam_angles(),
+        config=config,
+        collect=lambda state, info, aside: info.belief.pose.mean,
+    )
+    return truth.pose, means, state.log_odds
 
 
 def _print(report: dict[str, Any]) -> None:

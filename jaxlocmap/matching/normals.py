@@ -12,9 +12,7 @@ from jaxlocmap.types import Scanner
 
 _RADIUS = 0.3  # m: beams that end within it are fitted by one line, and the next on each side if it is not farther
 _NEIGHBOURS = 8  # beams on each side at most: a normal needs no more
-NO_RETURN = (
-    0.15  # m below `max_range`: there a beam without a return, which reads max_range and noise, looks like a hit
-)
+NO_RETURN = 0.15  # m below `max_range`: there a beam without a return, max_range and noise, looks like a hit
 
 
 class Points(NamedTuple):
