@@ -61,7 +61,7 @@ def normals_by_eigh(ranges, offset):
 
 
 @pytest.mark.parametrize("offset", [(0.0, 0.0, 0.0), (0.3, -0.1, 0.5)], ids=["centred", "mounted"])
-@pytest.mark.parametrize("pose", [(6.0, 2.0, 0.0), (1.0, 1.0, 0.7), (9.0, 5.4, 2.5)])
+@pytest.mark.parametrize("pose", [(6.0, 2.0, 0.0), (1.0, 1.0, 0.7), (9.0, 5.4, 2.5), (0.5, 3.0, 3.1)])
 def test_normals_are_numpys_beam_by_beam(pose, offset, tolerance):
     ranges = np.array(ranges_in_room(pose, noise=STD))
     ranges[[5, 6, 30]] = np.nan, 8.0, 0.01
@@ -72,6 +72,13 @@ def test_normals_are_numpys_beam_by_beam(pose, offset, tolerance):
     np.testing.assert_allclose(got.xy[valid], ends[valid], rtol=0, atol=tolerance(1e-12, 1e-5))
     across = np.abs(np.sum(np.asarray(got.normal) * normal, axis=1))  # of either sign
     np.testing.assert_allclose(across[valid], 1, rtol=0, atol=tolerance(1e-10, 1e-3))
+
+
+def test_three_beams_have_a_normal_between_them():
+    angles = np.array([-0.1, 0, 0.1])
+    got = surface_points(jnp.asarray(1 / np.cos(angles)), STD, scanner=scanner(angles=angles), gap=GAP)
+    assert got.valid.tolist() == [False, True, False]
+    np.testing.assert_allclose(np.abs(got.normal[1]), [1, 0], atol=1e-6)
 
 
 def test_a_beam_at_a_corner_a_gap_or_the_scans_end_has_no_normal():

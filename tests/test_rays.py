@@ -226,6 +226,15 @@ def test_beams_of_more_cells_than_can_be_counted_are_refused():
 
 
 @pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("max_range", [0.5, 1.0, 1.23])
+def test_the_longest_beam_has_one_cell_to_spare(max_range):
+    spec = GridSpec(origin=(0.0, 0.0), resolution=0.1, shape=(100, 100))
+    starts = 5 + 0.1 * np.linspace(0.01, 0.99, 50)
+    most = 1 + np.max(np.floor((starts + max_range) / 0.1) - np.floor(starts / 0.1))
+    assert rays.longest(spec, max_range) == most + 1
+    assert rays.longest(spec, 20.0) == 100  # the map's side
+
+
 def test_flat_cells_are_rows_and_columns_also_of_a_map_too_large_for_float32():
     """Of more than 2**24 cells, the last of which float32 cannot count."""
     spec = GridSpec(origin=(0.0, 0.0), resolution=0.1, shape=(6, 3_400_001))
