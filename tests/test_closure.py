@@ -11,7 +11,7 @@ import reference
 
 from jaxlocmap import graph as pose_graph
 from jaxlocmap import simulation
-from jaxlocmap.graph.closure import Closed, Closure, close_loops, scan_poses
+from jaxlocmap.graph.closure import Closed, Closure, _window, close_loops, scan_poses
 from jaxlocmap.graph.registration import SubmapScans, register
 from jaxlocmap.graph.trail import Trail, trail_of
 from jaxlocmap.matching.normals import surface_points
@@ -22,6 +22,7 @@ SPEC = GridSpec(origin=(-9.0, -9.0), resolution=0.1, shape=(180, 180))
 STD, SCALE = np.float32(0.03), np.float32(0.1)
 ANGLES = np.linspace(-1.2, 1.2, 61)
 EACH = 8  # scans of a submap
+WINDOW = (0.75, 0.12)  # m, rad: half of it is too narrow for every loop of the drive, so one program looks for all
 
 
 def report(steps, **fields):
@@ -108,7 +109,7 @@ def circle():
 @functools.cache
 def closed(**settings):
     truth, trail, points = circle()
-    closure = Closure(candidates=3, **settings)
+    closure = Closure(candidates=3, window=WINDOW, **settings)
     return close_loops(trail, points, STD, SCALE, spec=SPEC, closure=closure, first=truth[0])
 
 
@@ -126,7 +127,7 @@ def test_registration_finds_the_older_submap(x64):
         STD,
         SCALE,
         spec=SPEC,
-        window=(0.75, 0.15),  # one of those that loops are looked for in, whose program is there
+        window=WINDOW,
         most=Closure().points,
     )
     error = np.asarray(found.moved, np.float64) - exact
@@ -139,6 +140,17 @@ def test_registration_finds_the_older_submap(x64):
     moved = np.asarray(found.moved, np.float64) - exact - off
     S = np.asarray(found.cov, np.float64) + np.diag([0.2, 0.2, 0.1]) ** 2
     assert float(found.nis) == pytest.approx(moved @ np.linalg.solve(S, moved), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("std", "share"),
+    [((0.09, 0.09, 0.015), 8), ((0.15, 0.09, 0.015), 4), ((0.09, 0.3, 0.07), 2), ((0.09, 0.09, 0.2), 1)],
+)
+def test_the_window_holds_three_standard_deviations(std, share):
+    """The least of the widest one, its half, quarter and eighth; or the widest."""
+    closure = Closure(window=(2.4, 0.48))
+    assert _window(np.diag(std) ** 2, closure) == (2.4 / share, 0.48 / share)
+    assert _window(np.diag(100 * np.array(std)) ** 2, closure) == (2.4, 0.48)
 
 
 def test_loops_take_the_drift_out(x64):

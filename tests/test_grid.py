@@ -34,8 +34,12 @@ def scanned(log_odds, pose, ranges, angles, l_occ=L_OCC, l_free=L_FREE, *, spec=
 
 
 def scan(ranges, *, pose=POSE, angles=ANGLES, before=None):
-    """The map after one scan, by default of an empty map."""
+    """The map after one scan, by default of an empty map. Further beams that measure nothing change nothing (below), so
+    that one program serves scans of all lengths.
+    """
     before = jnp.zeros(SPEC.shape) if before is None else jnp.asarray(before)
+    more = len(ANGLES) - len(ranges)
+    ranges, angles = (np.append(x, np.full(more, value)) for x, value in ((ranges, np.nan), (angles, 0.0)))
     return np.asarray(scanned(before, jnp.asarray(pose), jnp.asarray(ranges), jnp.asarray(angles)))
 
 
@@ -246,11 +250,13 @@ def test_one_lower_clamp_after_all_scans_is_one_after_every_scan(seed, same):
 def test_cells_fall_below_the_clamp_and_rise_from_it():
     """What the test above is about. No cell passes the upper one."""
     poses, ranges = drive(0)
+    poses, ranges = map(np.asarray, (poses, ranges))
     clears, hits = slice(0, 13), slice(13, 20)
     fallen = unclamped(jnp.zeros(SPEC.shape), poses[clears], ranges[clears])
     assert fallen.min() < SPEC.l_min - 10
-    hit = jnp.tile(poses[hits][:1], (13, 1)), jnp.tile(ranges[hits][:1], (13, 1))
-    once = unclamped(jnp.array(fallen), hit[0], hit[1].at[1:].set(jnp.nan))
+    hit = np.tile(poses[hits][:1], (13, 1)), np.tile(ranges[hits][:1], (13, 1))
+    only_first = np.where(np.arange(13)[:, None] > 0, np.nan, hit[1]).astype(ranges.dtype)
+    once = unclamped(jnp.array(fallen), hit[0], only_first)
     raised = (fallen < SPEC.l_min - 1) & (once > fallen)
     assert raised.sum() >= 3
     assert np.all(once[raised] > SPEC.l_min)
@@ -317,8 +323,9 @@ def test_robots_at_once_are_robots_one_by_one(levels):
         value = value.reshape(*shape, *value.shape[1:])
         for axis in reversed(range(len(levels))):
             value = value if name in levels[axis] else value.take(0, axis)
-        args[name] = jnp.array(value)
-    got = batched(tuple(levels), args)
+        args[name] = jnp.array(value)  # in the precision of the job
+    args = jax.tree.map(np.asarray, args)
+    got = np.asarray(batched(tuple(levels), args))
     for place in itertools.product(*map(range, shape)):
         own = {
             name: value[tuple(i for i, names in zip(place, levels, strict=True) if name in names)]
@@ -336,16 +343,17 @@ STEP = 1e-5  # of a difference, whose next term is its square times a third deri
 
 
 def curved(given, poses, ranges):
-    """A score of the map before, l_occ and l_free that has a second derivative."""
-    return jnp.sum(jnp.array(WEIGHTS) * jnp.sin(mapped(given[0], poses, ranges, *given[1:])))
+    """A score of the map before, l_occ and l_free that has a second derivative; and the map after."""
+    after = mapped(given[0], poses, ranges, *given[1:])
+    return jnp.sum(jnp.array(WEIGHTS) * jnp.sin(after)), after
 
 
 def derivatives(given, direction, poses, ranges):
-    """First derivative, forward and reverse, and second, along a direction."""
+    """First derivative, forward and reverse, and second, along a direction; the score itself, and the map."""
     score = functools.partial(curved, poses=poses, ranges=ranges)
-    _, forward = jax.jvp(score, (given,), (direction,))
-    gradient, bend = jax.jvp(jax.grad(score), (given,), (direction,))
-    return forward, gradient, bend
+    value, forward, after = jax.jvp(score, (given,), (direction,), has_aux=True)
+    gradient, bend = jax.jvp(jax.grad(lambda given: score(given)[0]), (given,), (direction,))
+    return forward, gradient, bend, value, after
 
 
 def along(tree, direction):
@@ -353,36 +361,34 @@ def along(tree, direction):
 
 
 def lane(tree, index):
-    return jax.tree.map(lambda x: x[index], tree)
+    return jax.tree.map(lambda x: np.asarray(x)[index], tree)
 
 
 @pytest.mark.usefixtures("x64")
 def test_derivatives_through_the_clamps_are_finite_differences_alone_and_in_a_batch():
     """By the map before, l_occ and l_free; cells sit at both clamps, where the derivative is zero."""
     rng = np.random.default_rng(5)
-    scans = jax.tree.map(lambda *x: jnp.stack(x), *(drive(seed, scans=12) for seed in (0, 2)))
-    given = (
-        jnp.array(rng.uniform(-4.5, 3.9, (2, *SPEC.shape))).at[:, 4:11, 8:16].set(3.9),
-        jnp.array([0.83, 0.7]),
-        jnp.array([-0.37, -0.41]),
-    )
-    direction = jax.tree.map(lambda x: jnp.array(rng.normal(size=x.shape)), given)
-    score, slopes = jax.jit(curved), jax.jit(derivatives)
-    batch = jax.jit(jax.vmap(derivatives))(given, direction, *scans)
-    summed = jax.jit(jax.grad(lambda given: jnp.sum(jax.vmap(curved)(given, *scans))))(given)
+    scans = jax.tree.map(lambda *x: np.stack(x), *(drive(seed, scans=12) for seed in (0, 2)))
+    given = rng.uniform(-4.5, 3.9, (2, *SPEC.shape)), np.array([0.83, 0.7]), np.array([-0.37, -0.41])
+    given[0][:, 4:11, 8:16] = 3.9
+    direction = jax.tree.map(lambda x: rng.normal(size=x.shape), given)
+    slopes = jax.jit(derivatives)
+    *batch, _, _ = jax.jit(jax.vmap(derivatives))(given, direction, *scans)
+    summed = jax.jit(jax.grad(lambda given: jnp.sum(jax.vmap(curved)(given, *scans)[0])))(given)
     for i in range(2):
         here, way, both = lane(given, i), lane(direction, i), lane(scans, i)
-        after = mapped(here[0], *both, *here[1:])
+        ahead, behind = (
+            jax.tree.map(np.asarray, slopes(jax.tree.map(lambda x, d, step=step: x + step * d, here, way), way, *both))
+            for step in (STEP, -STEP)
+        )
+        forward, gradient, bend, _, after = jax.tree.map(np.asarray, slopes(here, way, *both))
         assert np.any(after == SPEC.l_min)
         assert np.any(after == SPEC.l_max)
-        ahead, behind = (jax.tree.map(lambda x, d, step=step: x + step * d, here, way) for step in (STEP, -STEP))
-        forward, gradient, bend = slopes(here, way, *both)
-        np.testing.assert_allclose(forward, (score(ahead, *both) - score(behind, *both)) / (2 * STEP), rtol=1e-6)
+        np.testing.assert_allclose(forward, (ahead[3] - behind[3]) / (2 * STEP), rtol=1e-6)
         np.testing.assert_allclose(along(gradient, way), forward, rtol=1e-12)
-        either = slopes(ahead, way, *both)[0] - slopes(behind, way, *both)[0]
-        np.testing.assert_allclose(along(bend, way), either / (2 * STEP), rtol=1e-6)
+        np.testing.assert_allclose(along(bend, way), (ahead[0] - behind[0]) / (2 * STEP), rtol=1e-6)
         exact = functools.partial(np.testing.assert_allclose, rtol=1e-12, atol=1e-12)
-        jax.tree.map(exact, lane(batch, i), (forward, gradient, bend))
+        jax.tree.map(exact, lane(batch, i), [forward, gradient, bend])
         jax.tree.map(exact, lane(summed, i), gradient)
 
 
@@ -390,14 +396,14 @@ def test_gradient_by_pose_and_ranges_is_zero():
     def score(pose, ranges):
         return jnp.sum(scanned(jnp.zeros(SPEC.shape), pose, ranges, jnp.array(ANGLES)) ** 2)
 
-    for gradient in jax.grad(score, argnums=(0, 1))(jnp.array(POSE), jnp.full(9, 2.0)):
-        np.testing.assert_array_equal(gradient, jnp.zeros_like(gradient))
+    for gradient in jax.jit(jax.grad(score, argnums=(0, 1)))(jnp.array(POSE), jnp.full(9, 2.0)):
+        np.testing.assert_array_equal(gradient, np.zeros(gradient.shape))
 
 
 # --- scores of a map
 
 entropy_bits, brier = jax.jit(quality.entropy_bits), jax.jit(quality.brier)
-calibration = jax.jit(quality.calibration, static_argnames="bins")
+calibration, score = (jax.jit(f, static_argnames="bins") for f in (quality.calibration, quality.score))
 
 
 def test_entropy_of_what_is_not_known_is_a_bit_a_cell(tolerance):
@@ -430,8 +436,8 @@ def test_entropy_loses_no_digit_where_a_cell_is_all_but_certain(size, tolerance)
 def test_brier_by_hand():
     """Probabilities 3/4, 1/4, 1/2 of occupied, free, not scored: (1/16 + 1/16) / 2."""
     log_odds = jnp.array([[math.log(3), -math.log(3), 0.0]])
-    score = brier(log_odds, jnp.array([[True, False, True]]), log_odds != 0)
-    assert float(score) == pytest.approx(1 / 16, rel=1e-6)
+    got = brier(log_odds, jnp.array([[True, False, True]]), log_odds != 0)
+    assert float(got) == pytest.approx(1 / 16, rel=1e-6)
 
 
 def test_brier_of_no_cell_is_no_number():
@@ -476,7 +482,7 @@ def test_calibration_is_numpys(tolerance):
 def test_a_probability_on_an_edge_falls_into_the_bin_above():
     """A half, exactly; and a cell that is not to be scored falls into none."""
     where = jnp.array([[True, True, True, False]])
-    sums = quality.score(jnp.zeros((1, 4)), jnp.array([[True, False, True, True]]), where, bins=4)
+    sums = score(jnp.zeros((1, 4)), jnp.array([[True, False, True, True]]), where, bins=4)
     np.testing.assert_array_equal(sums.cells, [0, 0, 3, 0])
     np.testing.assert_array_equal(sums.probability, [0, 0, 1.5, 0])
     np.testing.assert_array_equal(sums.occupied, [0, 0, 2, 0])
@@ -497,6 +503,7 @@ def test_a_cell_at_the_edge_of_two_bins_falls_into_the_upper():
 
 # --- course problem 1: the covariance of a beam's end
 
+end_covariance = jax.jit(grid.endpoint_covariance)
 BEAM_NOISE = np.diag([0.05**2, 0.01**2])
 POSE_COV = np.array([[4e-3, 1e-3, 2e-4], [1e-3, 3e-3, -1e-4], [2e-4, -1e-4, 4e-4]])
 
@@ -518,7 +525,7 @@ def test_course_problem_1_end_covariance_is_that_of_samples(noise):
     beams = rng.multivariate_normal(beam, np.zeros((2, 2)) if noise is None else noise, count)
     sampled = np.cov(endpoint(poses, beams).T)
     R = None if noise is None else jnp.array(noise)
-    got = np.asarray(grid.endpoint_covariance(jnp.array(POSE), jnp.array(POSE_COV), *jnp.array(beam), R))
+    got = np.asarray(end_covariance(jnp.array(POSE), jnp.array(POSE_COV), *map(jnp.asarray, beam), R))
     bound = 5 * np.sqrt((np.outer(np.diag(got), np.diag(got)) + got**2) / count)
     assert np.all(np.abs(got - sampled) < bound)
 
@@ -529,17 +536,17 @@ def test_end_covariance_is_the_propagation_by_the_endpoints_derivative(tolerance
         return pose[:2] + beam[0] * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
 
     pose, beam = jnp.array(POSE), jnp.array([5.0, 0.4])
-    J, J_beam = (np.asarray(j) for j in jax.jacfwd(point, argnums=(0, 1))(pose, beam))
-    args = (pose, jnp.array(POSE_COV), *beam)
+    J, J_beam = (np.asarray(j) for j in jax.jit(jax.jacfwd(point, argnums=(0, 1)))(pose, beam))
+    args = (pose, jnp.array(POSE_COV), jnp.array(5.0), jnp.array(0.4))
     rtol = tolerance(1e-12, 1e-5)
-    np.testing.assert_allclose(grid.endpoint_covariance(*args), J @ POSE_COV @ J.T, rtol=rtol)
+    np.testing.assert_allclose(end_covariance(*args), J @ POSE_COV @ J.T, rtol=rtol)
     expected = J @ POSE_COV @ J.T + J_beam @ BEAM_NOISE @ J_beam.T
-    np.testing.assert_allclose(grid.endpoint_covariance(*args, jnp.array(BEAM_NOISE)), expected, rtol=rtol)
+    np.testing.assert_allclose(end_covariance(*args, jnp.array(BEAM_NOISE)), expected, rtol=rtol)
 
 
 def test_walls_turn_fuzzier_with_reach():
     wide = [
-        np.trace(grid.endpoint_covariance(jnp.array(POSE), jnp.array(POSE_COV), jnp.array(r), jnp.array(0.4)))
+        np.trace(end_covariance(jnp.array(POSE), jnp.array(POSE_COV), jnp.array(r), jnp.array(0.4)))
         for r in (1.0, 4.0, 8.0)
     ]
     assert wide[0] < wide[1] < wide[2]

@@ -8,6 +8,7 @@ from test_experiments import data
 from test_logs import write
 
 from jaxlocmap import graph as pose_graph
+from jaxlocmap.graph.methods import MOST_LOOPS
 from jaxlocmap.logs import chained, read_graph, read_trajectory, write_csv, write_g2o
 
 G2O = """# a square
@@ -166,10 +167,24 @@ REFERENCES = {  # posterior optima of public graphs, g2o's residual, the first p
 }
 
 
+def filled_up(graph, *, poses, loops):
+    odometry, odometry_information, pair, loop, loop_information = map(np.asarray, graph)
+    more, links = poses - graph.poses, loops - graph.loops
+    return pose_graph.Graph(
+        np.concatenate([odometry, np.zeros((more, 3))]),
+        np.concatenate([odometry_information, np.tile(np.eye(3), (more, 1, 1))]),
+        np.concatenate([pair, np.tile(np.array([0, 1], pair.dtype), (links, 1))]),
+        np.concatenate([loop, np.zeros((links, 3))]),
+        np.concatenate([loop_information, np.zeros((links, 3, 3))]),
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "chi2"), REFERENCES.items())
 def test_public_graphs(x64, name, chi2):
-    file = read_graph(data("posegraph", name))
-    solution = pose_graph.solve(file.graph)
+    graph = read_graph(data("posegraph", name)).graph
+    if graph.loops > MOST_LOOPS:  # up to the largest, as `stack` does it: one program for all that are solved like it
+        graph = filled_up(graph, poses=3500, loops=1954)
+    solution = pose_graph.solve(graph)
     assert solution.converged
     assert float(solution.chi2) == pytest.approx(chi2, rel=3e-6)

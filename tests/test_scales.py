@@ -6,12 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
+from test_graph import edges_of
 
 from jaxlocmap import graph, simulation
 from jaxlocmap.graph.scales import Scales, _slope
 
 pytestmark = pytest.mark.usefixtures("x64")
 GRAPHS, POSES = 300, 12
+MORE = 3  # poses that the longest graph has more than the others
 
 
 @functools.cache
@@ -24,14 +27,33 @@ def drawn():
 def wrong():
     """Odometry that says twice its errors, loops that say half of theirs."""
     truth, graphs = drawn()
-    return truth, graph.scaled(graphs, Scales(jnp.array(2.0), jnp.array(0.5)))
+    told = jax.jit(graph.scaled)(graphs, Scales(jnp.array(2.0), jnp.array(0.5)))
+    return jax.tree.map(np.asarray, (truth, told))
+
+
+@functools.cache
+def filled():
+    """The graphs that are wrong, filled up to the length of one more of which no pose is known: the true poses, what is
+    filled up of them where the graph has it, the graphs, and which poses are known. All tuning is of these.
+    """
+    truth, graphs = wrong()
+    first = jax.tree.map(lambda x: x[0], graphs)
+    long = first._replace(
+        **{name: np.concatenate([getattr(first, name), getattr(first, name)[:MORE]]) for name in graphs._fields[:2]}
+    )
+    pairs = jax.tree.map(np.asarray, jax.jit(jax.vmap(lambda one: graph.stack([one, long])))(graphs))
+    more = jax.tree.map(lambda x: np.concatenate([x[:, 0], x[:1, 1]]), pairs)
+    known = np.zeros((GRAPHS + 1, POSES + MORE), bool)
+    known[:GRAPHS, :POSES] = True
+    padded = np.concatenate([truth, np.repeat(truth[:, -1:], MORE, axis=1)], axis=1)
+    return np.concatenate([padded, padded[:1]]), more, known
 
 
 @functools.cache
 def found():
-    """What the graphs that are wrong are tuned to."""
-    truth, graphs = wrong()
-    return graph.tune_scales(graphs, truth)
+    """What they are tuned to."""
+    truth, graphs, known = filled()
+    return graph.tune_scales(graphs, jnp.asarray(truth), jnp.asarray(known))
 
 
 def test_a_scale_is_of_standard_deviations():
@@ -50,45 +72,47 @@ def test_wrong_scales_are_found():
     assert after < before - 0.1
 
 
+@jax.jit
+def density(truth, graphs, known, scales):
+    """Of the graphs that are wrong, not filled up, at some scales: one after the other, which is compiled sooner."""
+    return jax.lax.map(lambda one: graph.pose_nll(graph.scaled(one[1], scales), one[0], known), (truth, graphs))
+
+
 def test_it_is_numpys_density_of_poses_that_are_known():
-    truth, graphs = (jax.tree.map(lambda x: x[0], tree) for tree in wrong())
+    truth, graphs = wrong()
     known = np.arange(POSES) < 9
-
-    @jax.jit
-    def solved(graphs):
-        solution = graph.solve(graphs, graph.dead_reckoning(graphs))
-        return solution.poses, graph.marginals(graphs, solution), graph.pose_nll(graphs, truth, jnp.asarray(known))
-
-    poses, cov, nll = jax.tree.map(np.asarray, solved(graphs))
-    error = np.asarray(truth) - poses
-    error[:, 2] = (error[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    nll = np.asarray(density(truth, graphs, known, Scales(jnp.array(1.0), jnp.array(1.0))))
+    poses, _, cov = reference.graph_optimum(truth[0], edges_of(jax.tree.map(lambda x: x[0], graphs)), steps=8)
+    error = truth[0] - poses
+    error[:, 2] = reference.wrap(error[:, 2])
+    each = [cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(POSES)]
     expected = sum(
-        0.5 * (error[k] @ np.linalg.solve(cov[k], error[k]) + np.log(np.linalg.det(cov[k]))) for k in range(1, 9)
+        0.5 * (error[k] @ np.linalg.solve(each[k], error[k]) + np.log(np.linalg.det(each[k]))) for k in range(1, 9)
     )
-    assert float(nll) == pytest.approx(expected, rel=1e-9)
+    assert nll[0] == pytest.approx(expected, rel=1e-9)
 
 
 def test_filled_up_poses_do_not_count():
-    truth, graphs = jax.tree.map(np.asarray, wrong())
-    each = [jax.tree.map(lambda x, i=i: x[i], graphs) for i in range(GRAPHS)]
-    long = each[0]._replace(
-        odometry=np.concatenate([each[0].odometry] * 2),
-        odometry_information=np.concatenate([each[0].odometry_information] * 2),
-    )
-    more = graph.stack([*each, long])
-    known = np.zeros((GRAPHS + 1, long.poses), bool)
-    known[:GRAPHS, :POSES] = True
-    padded = np.zeros((GRAPHS + 1, long.poses, 3))
-    padded[:GRAPHS, :POSES] = truth
-    filled, alone = graph.tune_scales(more, jnp.asarray(padded), jnp.asarray(known)), found()
-    np.testing.assert_allclose(filled[0], alone[0], rtol=1e-4)
-    assert filled[1:] == pytest.approx(alone[1:], rel=1e-8)
+    """The graphs by themselves are as likely before and after, and their best scales are the same: at the corner of a
+    parabola through three likelihoods.
+    """
+    scales, *before_and_after = found()
+
+    def alone(*at):
+        nll = density(*wrong(), np.ones(POSES, bool), Scales(*map(jnp.asarray, at)))
+        return np.asarray(nll).sum() / (GRAPHS * (POSES - 1))
+
+    best, h = np.array([scales.odometry, scales.loop]), 1e-3
+    assert before_and_after == pytest.approx([alone(1.0, 1.0), alone(*best)], rel=1e-8)
+    least = before_and_after[1]
+    for along in np.eye(2):
+        up, down = (alone(*best * np.exp(step * along)) for step in (h, -h))
+        assert abs(h / 2 * (down - up) / (up + down - 2 * least)) < 1e-4
 
 
 def test_its_slope_is_that_of_differences():
     """The mean over all graphs, by the logarithms of the scales, at scales of one."""
-    truth, graphs = wrong()
-    known = jnp.ones((GRAPHS, POSES), bool)
+    truth, graphs, known = jax.tree.map(jnp.asarray, filled())
 
     def at(logs):
         return jax.tree.map(np.asarray, _slope(jnp.asarray(logs), graphs, truth, known))
@@ -100,9 +124,14 @@ def test_its_slope_is_that_of_differences():
 
 
 def test_what_is_not_finite_is_refused():
-    truth, graphs = wrong()
-    spoiled = graphs._replace(odometry=graphs.odometry.at[3, 2, 0].set(jnp.nan))
-    with pytest.raises(ValueError, match=r"^graphs: expected finite poses and covariances at scales of one"):
-        graph.tune_scales(spoiled, truth)
-    with pytest.raises(ValueError, match=r"^truth: expected shape \(12, 3\)"):
+    """Whatever pose it is of: by default all count."""
+    truth, graphs, known = filled()
+    spoiled = graphs.odometry.copy()
+    spoiled[3, 2, 0] = np.nan
+    lost = truth.copy()
+    lost[~known] = np.nan
+    for bad in ((graphs._replace(odometry=spoiled), truth), (graphs, lost)):
+        with pytest.raises(ValueError, match=r"^graphs: expected finite poses and covariances at scales of one"):
+            graph.tune_scales(*jax.tree.map(jnp.asarray, bad))
+    with pytest.raises(ValueError, match=r"^truth: expected shape \(15, 3\)"):
         graph.tune_scales(graphs, truth[:, :5])

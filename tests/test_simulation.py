@@ -24,6 +24,10 @@ BOX = (4.5, 4.0, 7.5, 6.5)  # the box in the room: low x, low y, high x, high y,
 SHORT = like(CAPSTONE, name="short", steps=12, beams=5, detector=dict(period=4))
 FAILURE = 1e-6  # probability with which a statistical bound is missed by a right program
 
+# Once each, and not operation by operation.
+detect = jax.jit(simulation.detect, static_argnames="scenario")
+roll_out = jax.jit(simulation.roll_out, static_argnames="scenario")
+cast = jax.jit(jax.vmap(ray_cast, in_axes=(0, None, None, None)))
 draw_states = jax.jit(jax.vmap(simulation.draw_state, in_axes=(0, None)))
 simulated = jax.jit(simulation.simulate, static_argnames=("scenario", "scan"))
 
@@ -82,7 +86,7 @@ def test_given_the_course_s_random_numbers_the_drive_is_the_course_s(tolerance):
     """Its detector decides by what it measures, so everything is reported here and then cut as it does."""
     draws, expected = reference.course_draws(seed=4), reference.course_run(seed=4)
     noise = Noise()
-    truth, inputs = jax.jit(simulation.roll_out, static_argnames="scenario")(
+    truth, inputs = roll_out(
         simulation.Draws(
             drive=jnp.array(np.column_stack([draws["heading"] / noise.heading, draws["control"] / [noise.v, noise.w]])),
             detection=jnp.array(draws["detector"] / [noise.range, noise.bearing]),
@@ -195,21 +199,33 @@ def three(keys, worlds, noises, starts, *, scenario):
 
 def settings_of_three():
     """Keys, worlds, noises and starts."""
+    as_given = jax.tree.map(np.asarray, room())
     return (
         jax.random.split(jax.random.key(0), 3),
-        jax.tree.map(lambda x: jnp.stack([x, x * 1.5, x * 0.9]), room()),
-        jax.tree.map(lambda std: jnp.array([1.0, 2.0, 0.5]) * std, Noise()),
+        jax.tree.map(lambda x: jnp.asarray(np.stack([x, x * x.dtype.type(1.5), x * x.dtype.type(0.9)])), as_given),
+        jax.tree.map(lambda std: jnp.asarray(np.array([1.0, 2.0, 0.5]) * std), Noise()),
         jnp.array([SHORT.start, (2.0, 3.0, 1.0), (1.5, 1.2, -0.3)]),
     )
+
+
+def chosen_of(tree, which):
+    """One of a batch, or several; keys apart, without a program for every array."""
+    return jax.tree.map(lambda x: x[which] if is_key(x) else jnp.asarray(np.asarray(x)[which]), tree)
+
+
+def is_key(x):
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def test_a_batch_of_keys_worlds_noises_and_starts_is_a_python_loop(tolerance):
     batch = settings_of_three()
     together = three(*batch, scenario=SHORT)
     for i in range(3):
-        alone = simulated(*jax.tree.map(lambda x, i=i: x[i], batch), scenario=SHORT)
+        alone = simulated(*chosen_of(batch, i), scenario=SHORT)
         jax.tree.map(
-            lambda a, b, i=i: np.testing.assert_allclose(a, b[i], rtol=0, atol=tolerance(1e-12, 1e-5)), alone, together
+            lambda a, b, i=i: np.testing.assert_allclose(a, np.asarray(b)[i], rtol=0, atol=tolerance(1e-12, 1e-5)),
+            alone,
+            together,
         )
 
 
@@ -217,8 +233,9 @@ def test_a_drive_depends_on_its_key_and_not_on_its_company():
     """Bit for bit, whoever else is in the batch, and wherever in it; and with another key it is another."""
 
     def batch(*chosen, keys=None):
-        settings = jax.tree.map(lambda x: x[jnp.array(chosen)], settings_of_three())
-        return three(*settings if keys is None else (keys, *settings[1:]), scenario=SHORT)
+        settings = chosen_of(settings_of_three(), np.array(chosen))
+        drives = three(*settings if keys is None else (keys, *settings[1:]), scenario=SHORT)
+        return jax.tree.map(np.asarray, drives)
 
     first, second = batch(0, 1, 2), batch(2, 0, 0)
     for i, j in ((0, 1), (0, 2), (2, 0)):
@@ -339,9 +356,8 @@ def test_the_noise_of_drive_and_sensors_is_what_the_equations_say(capstones, tol
     edge = sure & (distance > CAPSTONE.detector.max_range - noise.range)
     assert np.sum(edge) > 100
     assert_standard_normal(observations[0][edge])
-    cast = jax.jit(jax.vmap(lambda pose: ray_cast(pose, CAPSTONE.beam_angles(), room().segments, 8.0)))
     run = slice(0, 20)
-    exact = np.stack([cast(pose) for pose in truth.pose[run]])
+    exact = np.stack([cast(pose, CAPSTONE.beam_angles(), room().segments, 8.0) for pose in truth.pose[run]])
     scan = (np.asarray(inputs.ranges[run]) - exact) / noise.scan
     clear = exact > 0.5  # a reading is never below the least range
     strayed = clear & (np.abs(scan) > 6)  # in float32 a ray past a corner may meet another wall here than there
@@ -402,7 +418,7 @@ def test_a_detector_off_the_centre_sees_from_where_it_sits(offset, tolerance):
     for turn in np.linspace(-3, 3, 7):
         mark = pose[:2] + 2.9 * np.array([np.cos(turn), np.sin(turn)])
         to = mark - sensor
-        z, near = simulation.detect(jnp.zeros(2), jnp.array(pose), jnp.array(mark), room(), Noise(), scenario=scenario)
+        z, near = detect(jnp.zeros(2), jnp.array(pose), jnp.array(mark), room(), Noise(), scenario=scenario)
         assert bool(near) == (np.hypot(*to) < 3)
         np.testing.assert_allclose(z[0], np.hypot(*to), rtol=0, atol=tolerance(1e-12, 1e-5))
         turned = reference.wrap(float(z[1]) - (np.arctan2(to[1], to[0]) - pose[2] - dtheta))
@@ -447,7 +463,7 @@ def test_a_drive_goes_by_the_robot_s_own_period_reach_and_looks(tolerance):
     none = Noise(*[0.0] * (len(Noise._fields) - 1))
     draws = simulation.Draws(jnp.ones((6, 3)), jnp.ones((6, 4, 2)), jnp.ones((6, 5)))
     start = jnp.array([1.0, 9.0, 0.3])
-    truth, inputs = simulation.roll_out(draws, room(), none, start, scenario=scenario)
+    truth, inputs = roll_out(draws, room(), none, start, scenario=scenario)
     pose, poses = np.array(start, float), []
     for _ in range(6):
         pose = pose + 0.25 * np.array([np.cos(pose[2]), np.sin(pose[2]), 0.4])
@@ -462,7 +478,7 @@ def test_a_drive_goes_by_the_robot_s_own_period_reach_and_looks(tolerance):
     assert 1 < valid.sum() < 8
     np.testing.assert_array_equal(inputs.valid, valid)
     np.testing.assert_allclose(inputs.z[..., 0], np.where(valid, distance, 0), rtol=0, atol=atol)
-    exact = [ray_cast(jnp.array(p), scenario.beam_angles(), room().segments, 2.0) for p in poses]
+    exact = cast(jnp.array(poses), scenario.beam_angles(), room().segments, 2.0)
     np.testing.assert_allclose(inputs.ranges, exact, rtol=0, atol=tolerance(1e-9, 1e-4))
 
 
@@ -477,7 +493,7 @@ def test_a_scan_s_noise_comes_after_the_cut_at_its_reach_and_ends_at_its_least_r
 def test_a_landmark_at_the_very_reach_is_not_seen():
     for reach, near in ((3.0, False), (np.nextafter(np.float32(3), np.float32(0)), True)):
         mark = jnp.array([float(reach), 0.0])
-        assert bool(simulation.detect(jnp.zeros(2), jnp.zeros(3), mark, room(), Noise(), scenario=OTHER)[1]) is near
+        assert bool(detect(jnp.zeros(2), jnp.zeros(3), mark, room(), Noise(), scenario=OTHER)[1]) is near
 
 
 @pytest.mark.parametrize(("drawn", "false"), [(0.29, True), (0.31, False)])
@@ -485,7 +501,7 @@ def test_a_false_observation_is_made_of_its_own_draws(drawn, false):
     """Anywhere within the robot's own reach, and all around; what is drawn decides whether it is one."""
     draws, noise = jnp.array([1.0, -1.0, drawn, 0.25, 0.875]), Noise(range=0.1, bearing=0.2, outlier_rate=0.3)
     scenario = like(OTHER, detector=dict(outliers=True))
-    z, near = simulation.detect(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), room(), noise, scenario=scenario)
+    z, near = detect(draws, jnp.zeros(3), jnp.array([2.0, 0.0]), room(), noise, scenario=scenario)
     assert near
     np.testing.assert_allclose(z, [0.75, 0.75 * np.pi] if false else [2.1, -0.2], rtol=1e-6)
 
