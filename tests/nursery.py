@@ -24,6 +24,7 @@ def become(arguments, environment):
     os.environ.clear()
     os.environ.update(environment)
     jax.config.update("jax_compilation_cache_dir", environment.get("JAX_COMPILATION_CACHE_DIR") or None)
+    jax.config.update("jax_disable_most_optimizations", environment["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1")
     sys.orig_argv = [sys.executable, *arguments]
     if arguments[0] == "-m":
         sys.argv = arguments[1:]
