@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from disks import full_disk
+from programs import ended, start
 
 from jaxlocmap.monte_carlo import checkpoint as checkpoint_module
 from jaxlocmap.monte_carlo import chunks, monte_carlo
@@ -267,16 +268,16 @@ def test_a_second_study_is_refused_while_the_first_works_and_goes_on_after(folde
 
 
 @pytest.mark.slow
-def test_the_lock_of_a_killed_process_holds_nobody_up(folder):
-    code = f"""if 1:
-        import os, signal, sys
-        sys.path.insert(0, {str(Path(__file__).parent)!r})
-        import test_checkpoint, pathlib
-        parts = test_checkpoint.at(pathlib.Path({str(folder)!r}))
-        parts.open(test_checkpoint.STUDY, range(8))
+def test_the_lock_of_a_killed_process_holds_nobody_up(folder, tmp_path):
+    (tmp_path / "killed.py").write_text(f"""if 1:
+        import os, pathlib, signal
+        from jaxlocmap.monte_carlo.checkpoint import Checkpoint
+        parts = Checkpoint(pathlib.Path({str(folder.parent)!r}))
+        parts.open({STUDY!r}, range(8))
         os.kill(os.getpid(), signal.SIGKILL)
-    """
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
+    """)
+    status, _, err = ended(start(tmp_path / "killed.py"))
+    assert status == -9, err
     assert (folder / ".lock-0").exists()
     assert opened(folder, resume=True)[1] == set()
 

@@ -3,14 +3,12 @@
 import importlib
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from programs import ON_CPU
 
 from jaxlocmap.cli import command
 from jaxlocmap.cli import main as jobs
@@ -19,15 +17,9 @@ pytestmark = pytest.mark.slow
 EXPERIMENTS = Path(__file__).parent.parent / "experiments"
 
 
-def run_alone(*command):
-    """The program's exit status and output, as from a command line."""
-    done = subprocess.run([sys.executable, *map(str, command)], env=ON_CPU, capture_output=True, text=True, check=False)
-    return done.returncode, done.stdout + done.stderr
-
-
 @pytest.fixture
 def run(capsys, monkeypatch, as_a_program):
-    """The same in this process, where JAX has started."""
+    """A program's exit status and output, as from a command line, in this process, where JAX has started."""
 
     def leave(status, last_words):
         print(last_words, file=sys.stderr)
@@ -87,10 +79,10 @@ STUDY_FIELDS = [
 ]
 
 
-def test_a_study_writes_its_report_and_figures(tmp_path):
+def test_a_study_writes_its_report_and_figures(run, tmp_path):
     # Without a gate and from a drawn start it needs no reference, which a study without maps below has.
-    options = ("--quick", "--gate", "None", "--start", "drawn")
-    status, output = run_alone("-m", "jaxlocmap", "study", *options, "--out", tmp_path)
+    options = ("--quick", "--gate", "None", "--start", "drawn", "--beams", 9)
+    status, output = run("study", *options, "--out", tmp_path)
     assert status == 0, output
     written = report(tmp_path)
     assert set(STUDY_FIELDS) <= set(written)
@@ -107,15 +99,19 @@ def test_a_study_writes_its_report_and_figures(tmp_path):
 def test_a_study_takes_params_from_a_file_and_can_leave_out_the_map(run, tmp_path):
     plant = {"Q": [[0.02**2, 0], [0, 0.051**2]], "R": [[0.08**2, 0], [0, 0.02**2]], "l_occ": 0.85, "l_free": -0.4}
     (tmp_path / "plant.json").write_text(json.dumps(plant))
-    arguments = ("--quick", "--no-map", "--motion", "euler", "--params", tmp_path / "plant.json", "--out", tmp_path)
-    status, output = run("study", *arguments)
+    # As many runs as the reference has and the robot's own motion, so that both are one program.
+    size = ("--no-map", "--motion", "euler", "--runs", 2000, "--steps", 60)
+    status, output = run("study", *size, "--params", tmp_path / "plant.json", "--out", tmp_path)
     assert status == 0, output
     written = report(tmp_path)
     np.testing.assert_allclose(written["params"]["Q"], plant["Q"], rtol=1e-6)
     assert "map" not in written
     assert not (tmp_path / "map.png").exists()
-    # 100 runs: ANEES 2.90 with a standard error near 0.1; the course's noise would give 2.31.
-    assert 2.5 < written["anees"] < 3.3
+    # With nearly the robot's own noise ANEES is that of the reference, 2.22, with a standard error of 0.03 in each; the
+    # course's noise would give 1.45.
+    assert written["anees_standard_error"] < 0.04
+    assert written["anees"] == pytest.approx(written["anees_reference"], abs=0.2)
+    assert 2.0 < written["anees_reference"] < 2.45
 
 
 def test_capstone_reproduces_the_numbers_of_the_course(run, tmp_path):

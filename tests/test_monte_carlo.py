@@ -2,17 +2,15 @@
 
 import os
 import re
-import subprocess
-import sys
 import textwrap
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import ended, start
 
 from jaxlocmap._internal import batching
 from jaxlocmap.monte_carlo import chunks, hosts, monte_carlo, use_all_cores
@@ -243,16 +241,14 @@ SCRIPT = """
 
 @pytest.mark.slow
 @pytest.mark.parametrize("two", [True, False], ids=["two_devices", "all_cores"])
-def test_all_devices_together_give_what_one_gives(two):
+def test_all_devices_together_give_what_one_gives(two, tmp_path):
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     script = textwrap.dedent(SCRIPT.format(two=two, cores=cores, x64=jax.config.jax_enable_x64))
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": str(Path(__file__).parents[1])}
-    environment.pop("XLA_FLAGS", None)
-    process = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=120, check=False
-    )
-    assert process.returncode == 0, process.stderr
-    assert process.stdout == f"{2 if two else cores} devices\n"
+    (tmp_path / "script.py").write_text(script)
+    # As users compile it.
+    status, said, err = ended(start(tmp_path / "script.py", XLA_FLAGS="", JAX_DISABLE_MOST_OPTIMIZATIONS="0"))
+    assert status == 0, err
+    assert said == f"{2 if two else cores} devices\n"
 
 
 def test_asking_for_all_cores_too_late_leaves_the_devices_as_they_are():

@@ -7,39 +7,46 @@ import subprocess
 import time
 
 import pytest
-from programs import ON_CPU, ROOT, WALKS, ended, report, result, start
+from programs import ON_CPU, ROOT, WALKS, anew, ended, report, result, start
 
 from jaxlocmap.cli import compute
 
 pytestmark = pytest.mark.slow
 # Without a gate and from a drawn start, which needs no reference.
-STUDY = ("--no-map", "--gate", "None", "--start", "drawn", "--runs", 8_000, "--chunk", 8, "--steps", 30)
+STUDY = ("--no-map", "--gate", "None", "--start", "drawn", "--runs", 1000, "--chunk", 1, "--steps", 30)
+# One study after the other in one process: what the first has traced and compiled the second has.
+STUDIES = """
+import sys
+
+from jaxlocmap.__main__ import main
+
+_, study, *folders = sys.argv
+for out in folders:
+    sys.argv = ["jaxlocmap", "study", *study.split(), "--out", out]
+    main()
+"""
 
 
 def test_a_killed_study_goes_on_to_the_report_of_an_uninterrupted_one(tmp_path):
-
-    def consistency(*arguments):
-        return start("-m", "jaxlocmap", "study", *STUDY, *arguments)
-
-    status, _, err = ended(consistency("--out", tmp_path / "whole"))
-    assert status == 0, err
-    whole = report(tmp_path / "whole")
-    assert whole["resumed_runs"] == 0
-
-    killed, parts = consistency("--out", tmp_path / "killed"), tmp_path / "killed" / "parts"
+    study, parts = " ".join(map(str, STUDY)), tmp_path / "killed" / "parts"
+    (tmp_path / "studies.py").write_text(STUDIES)
+    killed = start(tmp_path / "studies.py", study, tmp_path / "whole", tmp_path / "killed")
     while killed.poll() is None and len(list(parts.glob("part-???"))) < 0.7 * 256:
         time.sleep(0.002)
     killed.send_signal(signal.SIGKILL)
-    assert ended(killed)[0] == -signal.SIGKILL
+    status, _, err = ended(killed)
+    assert status == -signal.SIGKILL, err
+    whole = report(tmp_path / "whole")
+    assert whole["resumed_runs"] == 0
     kept = sorted(parts.glob("part-???"))
     assert 0.7 * 256 <= len(kept) < 256
     os.truncate(kept[100], 99)
 
-    status, said, err = ended(consistency("--resume", "--out", tmp_path / "killed"))
+    status, said, err = ended(anew("-m", "jaxlocmap", "study", *STUDY, "--resume", "--out", tmp_path / "killed"))
     assert status == 0, err
     assert f"part {int(kept[100].name[5:])} in {parts} is damaged" in said
     resumed = report(tmp_path / "killed")
-    assert 3 * 8 * (len(kept) - 1) <= resumed["resumed_runs"] <= 4 * 8 * (len(kept) - 1)  # 3 or 4 chunks a part
+    assert 3 * (len(kept) - 1) <= resumed["resumed_runs"] <= 4 * (len(kept) - 1)  # 3 or 4 chunks, of a run, a part
     assert list(resumed) == list(whole)
     assert resumed["devices"] == whole["devices"]
     assert result(tmp_path / "killed") == result(tmp_path / "whole")

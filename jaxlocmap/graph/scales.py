@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.optimize
 
 from jaxlocmap import checks
 from jaxlocmap._internal.linalg import Matrix, ldl, mahalanobis
@@ -88,6 +87,8 @@ def tune_scales(graphs: Graph, truth: jax.Array, known: jax.Array | None = None)
     Raises:
         ValueError: a wrong shape; poses that are not finite at scales of one.
     """
+    from scipy import optimize  # takes its time, and is needed here alone
+
     known = jnp.ones(truth.shape[:2], bool) if known is None else known
 
     def value(logs: np.ndarray) -> tuple[float, np.ndarray]:
@@ -99,5 +100,5 @@ def tune_scales(graphs: Graph, truth: jax.Array, known: jax.Array | None = None)
     if not np.isfinite(before):
         raise ValueError("graphs: expected finite poses and covariances at scales of one, got some that are not")
     bounds = [(-_FARTHEST, _FARTHEST)] * len(start)
-    found = scipy.optimize.minimize(value, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    found = optimize.minimize(value, start, jac=True, method="L-BFGS-B", bounds=bounds)
     return Scales(*jnp.exp(jnp.asarray(found.x, truth.dtype))), before, float(found.fun)

@@ -8,8 +8,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
-import scipy.sparse.csgraph
 
 from jaxlocmap import checks
 from jaxlocmap.graph import methods
@@ -157,13 +155,12 @@ def faults(graph: Graph, solution: Solution, start: jax.Array | None = None) -> 
 
 def parts(graph: Graph) -> np.ndarray:
     """Which part of the graph each pose is in, (N,) from 0, that of the first pose."""
+    from scipy.sparse import coo_matrix, csgraph  # takes its time, and is needed here alone
+
     n = graph.poses
     chain = np.any(np.asarray(graph.odometry_information), axis=(1, 2))
     tied = np.any(np.asarray(graph.loop_information), axis=(1, 2))
     a, b = np.asarray(graph.pair)[tied].T
     k = np.flatnonzero(chain)
     ends = np.concatenate([k, a]), np.concatenate([k + 1, b])
-    _, label = scipy.sparse.csgraph.connected_components(
-        scipy.sparse.coo_matrix((np.ones(len(ends[0])), ends), shape=(n, n)), directed=False
-    )
-    return label
+    return csgraph.connected_components(coo_matrix((np.ones(len(ends[0])), ends), shape=(n, n)), directed=False)[1]

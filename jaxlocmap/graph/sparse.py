@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
-import scipy.sparse.linalg
 
 from jaxlocmap._internal.linalg import Matrix
 from jaxlocmap.graph.loop_space import System, Vectors
@@ -136,15 +134,15 @@ def _pattern(row: bytes, column: bytes) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def _scipy_solve(row: Any, column: Any, value: Any, b: Any) -> np.ndarray:
+    from scipy.sparse import csc_matrix, linalg  # takes its time, and is needed here alone
+
     row, column, value, b = (np.asarray(x) for x in (row, column, value, b))
     place, indices, starts = _pattern(row.tobytes(), column.tobytes())
     both = np.concatenate([value, np.where(row == column, 0, value)])
     data = np.bincount(place, both, len(indices))
-    matrix = scipy.sparse.csc_matrix((data, indices, starts), shape=(len(starts) - 1,) * 2)
+    matrix = csc_matrix((data, indices, starts), shape=(len(starts) - 1,) * 2)
     try:
-        factor = scipy.sparse.linalg.splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        factor = linalg.splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError:  # the factor is exactly singular
         return np.full_like(b, np.nan)
     pivots = np.abs(factor.U.diagonal())
