@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.stats
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
 
@@ -161,6 +162,21 @@ def test_gradients_are_what_differences_give(names, x64):
         assert slope == pytest.approx((up[name] - down[name]) / (2 * h), rel=1e-5, abs=1e-8), name
 
 
+def test_scipy_takes_the_same_gradient(x64):
+    start, batch, names = simulation.course_params(), drives(), ("range", "bearing")
+
+    def slope(x):
+        _, terms, slopes = judged(start, batch, dict(zip(names, x.tolist(), strict=True)))
+        return terms["innovation_nll"], np.array([slopes["innovation_nll"][name] for name in names])
+
+    found = scipy.optimize.minimize(slope, np.zeros(2), jac=True, method="L-BFGS-B")
+    assert found.success
+    assert found.fun < slope(np.zeros(2))[0] - 0.1
+    assert np.all(np.abs(found.jac) < 1e-3)
+    with pytest.raises(ValueError, match="tuned: expected some of"):
+        tuning.coordinates_objective(ALL, start, ("speed",))
+
+
 def with_one_false_reading(metres):
     batch = drives()
     z = np.array(batch.inputs.z)
@@ -203,7 +219,8 @@ def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     )
     # Where false readings lie within half a metre, many lie near the gate: at four deviations of a decimetre.
     noise = simulation.Noise(outlier_rate=0.4, blocks={"fix": 0.1})
-    lying = like(SHORT, name="lying", steps=60, detector=dict(outliers=True, period=2, max_range=0.5), robot=dict(sensor=fix))
+    detector = dict(outliers=True, period=2, max_range=0.5)
+    lying = like(SHORT, name="lying", steps=60, detector=detector, robot=dict(sensor=fix))
     batch = tuning.simulated(jax.random.key(2), 64, simulation.room(), noise, scenario=lying)
     own, h = simulation.own_params(noise, lying), 0.02
     places, weights = np.polynomial.legendre.leggauss(6)
