@@ -1,6 +1,7 @@
 """Sensors of one's own, as values: in a run, in a study, in tuning; and what a detector reports of landmarks."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -105,7 +106,7 @@ TOGETHER = Sensor(
 )
 
 
-@pytest.fixture(scope="module")
+@functools.cache
 def seen_together():
     """Sixty-four drives, and what the three sensors say of them wherever a landmark is in sight."""
     scenario = like(simulation.LOOP, steps=60, robot={"sensor": TOGETHER})
@@ -116,12 +117,12 @@ def seen_together():
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 @OWN
-def test_its_noise_is_tuned(sensor, seen_together):
+def test_its_noise_is_tuned(sensor):
     _, _, config, own = setting(sensor, steps=60)
     tuned = sensor.noise.components
     mine = [TOGETHER.noise.components.index(name) for name in tuned]
-    inputs = seen_together.inputs
-    batch = seen_together._replace(inputs=inputs._replace(z=np.asarray(inputs.z)[..., mine]))
+    batch = seen_together()
+    batch = batch._replace(inputs=batch.inputs._replace(z=np.asarray(batch.inputs.z)[..., mine]))
     objective = tuning.Objective(config, (("innovation_nll", 1.0),))
     start = own.with_block(sensor.noise, 4 * own.block(sensor.noise))
     found = tuning.fit(objective, start, batch, tuned=tuned, epochs=3)
