@@ -1,6 +1,7 @@
 """Sensors of one's own, as values: in a run, in a study, in tuning; and what a detector reports of landmarks."""
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -84,8 +85,8 @@ def test_a_jacobian_is_that_of_autodiff_wherever_the_sensor_sits(sensor, offset,
 @pytest.mark.slow
 @OWN
 def test_a_study_of_an_honest_filter_is_consistent(sensor):
-    """Bounds are in standard errors of these 500 drives, of 300 steps each."""
-    scenario, noise, config, params = setting(sensor, steps=300)
+    """Bounds are in standard errors of these 500 drives, of 100 steps each."""
+    scenario, noise, config, params = setting(sensor, steps=100)
     scene = params, simulation.room(), noise, scenario.prior()
     report = summarise(monte_carlo(Study(scenario, config), jax.random.key(0), 500, *scene).value, config)
     assert abs(report["anees"] - 3) < 4 * report["anees_standard_error"]
@@ -94,18 +95,36 @@ def test_a_study_of_an_honest_filter_is_consistent(sensor):
     reach = report["innovation_lag_one_band_95"]
     assert all(abs(value) < 3 * reach[name] for name, value in report["innovation_lag_one"].items())
     if not sensor.landmarks:
-        assert report["observations"] == 500 * 60
+        assert report["observations"] == 500 * 20
+
+
+# All three in one, so that one simulation does for each of them.
+TOGETHER = Sensor(
+    Block("together", tuple(name for sensor in STD for name in sensor.noise.components), ("m", "m", "rad", "rad")),
+    expected=lambda state, landmark: jnp.concatenate([sensor.expected(state, landmark) for sensor in STD]),
+    angles=(2, 3),
+)
+
+
+@functools.cache
+def seen_together():
+    """Sixty-four drives, and what the three sensors say of them wherever a landmark is in sight."""
+    scenario = like(simulation.LOOP, steps=60, robot={"sensor": TOGETHER})
+    noise = simulation.Noise(blocks={"together": np.repeat(list(STD.values()), [sensor.dim for sensor in STD])})
+    return tuning.simulated(jax.random.key(1), 64, simulation.room(), noise, scenario=scenario)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 @OWN
 def test_its_noise_is_tuned(sensor):
-    scenario, noise, config, own = setting(sensor, steps=150)
-    batch = tuning.simulated(jax.random.key(1), 64, simulation.room(), noise, scenario=scenario)
+    _, _, config, own = setting(sensor, steps=60)
+    tuned = sensor.noise.components
+    mine = [TOGETHER.noise.components.index(name) for name in tuned]
+    batch = seen_together()
+    batch = batch._replace(inputs=batch.inputs._replace(z=np.asarray(batch.inputs.z)[..., mine]))
     objective = tuning.Objective(config, (("innovation_nll", 1.0),))
     start = own.with_block(sensor.noise, 4 * own.block(sensor.noise))
-    tuned = sensor.noise.components
     found = tuning.fit(objective, start, batch, tuned=tuned, epochs=3)
     sure = tuning.standard_errors(objective, found.params, batch, tuned)
     error = np.abs(sure.estimate - STD[sensor])

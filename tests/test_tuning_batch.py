@@ -31,8 +31,8 @@ def first_steps(batch, steps, slots):
         landmark=cut.inputs.landmark[..., :slots], z=cut.inputs.z[..., :slots, :], valid=cut.inputs.valid[..., :slots]
     )
     cut = cut._replace(inputs=inputs)
-    return jax.tree.map(lambda x: x[:, :steps], cut._replace(prior=None, landmarks=None))._replace(
-        prior=cut.prior, landmarks=cut.landmarks
+    return jax.tree.map(lambda x: x[:, :steps], cut._replace(prior=None, landmarks=None, beam_angles=None))._replace(
+        prior=cut.prior, landmarks=cut.landmarks, beam_angles=cut.beam_angles
     )
 
 
@@ -40,7 +40,7 @@ def first_steps(batch, steps, slots):
 
 
 def test_padding_changes_nothing(tolerance):
-    batch = drives(scans=False)
+    batch = drives()
     short = first_steps(batch, 7, 3)
     joined = tuning.join(tuning.pick(batch, slice(0, 3)), short)
     assert joined.counted.shape == (4, 12)
@@ -51,12 +51,12 @@ def test_padding_changes_nothing(tolerance):
 
 
 def first_sequence():
-    return tuning.pick(drives(scans=False), slice(0, 1))
+    return tuning.pick(drives(), slice(0, 1))
 
 
 def is_the_first_sequence(cut, tolerance):
     np.testing.assert_array_equal(np.asarray(cut.counted).sum(), 12)
-    whole = jax.tree.map(lambda x: x[0], every_sum(drives(scans=False)))
+    whole = jax.tree.map(lambda x: x[0], every_sum(drives()))
     near(jax.tree.map(jnp.sum, every_sum(cut)), whole, tolerance)
 
 
@@ -69,7 +69,7 @@ def test_windows_that_run_in_from_the_prior_are_the_whole(tolerance):
 
 def test_windows_start_where_they_are_told(tolerance):
     """Started at the filter's own beliefs, windows see what the filter saw."""
-    beliefs = jax.jit(lambda batch: tuning.beliefs(OWN, batch, config=ONLY_POSES))(drives(scans=False))
+    beliefs = jax.jit(lambda batch: tuning.beliefs(OWN, batch, config=ONLY_POSES))(drives())
     cut = tuning.windows(first_sequence(), 3, run_in=2, beliefs=jax.tree.map(lambda x: x[:1], beliefs))
     assert cut.counted.shape == (4, 5)
     np.testing.assert_array_equal(cut.counted.sum(axis=1), 3)
@@ -82,15 +82,15 @@ def test_blocks_share_out_the_steps_of_one_sequence(tolerance):
     np.testing.assert_array_equal(cut.counted.sum(axis=0), 1)
     is_the_first_sequence(cut, tolerance)
     with pytest.raises(ValueError, match="expected one sequence"):
-        tuning.blocks(drives(scans=False), 2)
+        tuning.blocks(drives(), 2)
 
 
 def test_an_unknown_truth_is_not_judged():
-    batch = drives(scans=False)
+    batch = drives()
     truth = np.array(batch.truth[0])
     truth[3:6] = np.nan
     inputs, prior = jax.tree.map(lambda x: x[0], (batch.inputs, batch.prior))
-    one = tuning.sequence(inputs, prior, landmarks=batch.landmarks, truth=truth)
+    one = tuning.sequence(inputs, prior, landmarks=batch.landmarks, truth=truth, beam_angles=batch.beam_angles)
     sums = every_sum(tuning.join(one, tuning.pick(batch, slice(1, 4))))
     assert float(sums["pose_nll"][1][0]) == 9
     assert float(sums["innovation_nll"][1][0]) == np.asarray(batch.inputs.valid)[0].sum()
@@ -248,11 +248,12 @@ def test_what_is_picked_keeps_what_all_share():
 
 
 def test_simulated_drives_hang_on_all_of_their_key_and_each_on_its_own():
-    """The same program as that of `drives`."""
+    """The same program as that of `drives`, in the same context."""
 
     def made(*words):
         key = jax.random.wrap_key_data(jnp.array(words, jnp.uint32))
-        return tuning.simulated(key, 4, simulation.room(), simulation.Noise(), scenario=SHORT, scans=True)
+        with jax.ensure_compile_time_eval():
+            return tuning.simulated(key, 4, simulation.room(), simulation.Noise(), scenario=SHORT, scans=True)
 
     batches = [made(0, 0), made(0, 1), made(1, 0)]
     ends = np.concatenate([np.asarray(batch.truth)[:, -1] for batch in batches])
@@ -283,7 +284,11 @@ def test_a_start_that_is_not_exact_is_drawn_from_the_prior_with_half_of_the_run_
 
 def test_simulated_rooms_may_differ_from_run_to_run():
     rooms = jax.vmap(random_room)(jax.random.split(jax.random.key(1), 3))
-    batch = tuning.simulated(jax.random.key(0), 3, rooms, simulation.Noise(), scenario=SHORT, scans=True, worlds=True)
+    batch = jax.eval_shape(
+        lambda key, rooms: tuning.simulated(key, 3, rooms, simulation.Noise(), scenario=SHORT, scans=True, worlds=True),
+        jax.random.key(0),
+        rooms,
+    )
     assert batch.inputs.ranges.shape == (3, 12, 9)
     assert batch.landmarks.shape == (4, 2)
     segments = np.asarray(rooms.segments)
@@ -296,7 +301,7 @@ def test_simulated_rooms_may_differ_from_run_to_run():
 
 
 def test_what_does_not_fit_together_is_named():
-    batch = drives(scans=False)
+    batch = drives()
     with pytest.raises(ValueError, match="at least one, got none"):
         tuning.join()
     with pytest.raises(ValueError, match=r"truth: expected in all batches or in none, got it in 1 of 2"):

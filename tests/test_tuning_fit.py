@@ -8,9 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-import scipy.optimize
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
-from jax.flatten_util import ravel_pytree
 
 from jaxlocmap import Config, Gaussian, Params, simulation, tuning
 from jaxlocmap.tuning.fit import Evaluation, _line_search
@@ -85,19 +83,6 @@ def test_what_is_kept_skipped_and_left_alone():
     assert [len(so_far.trace.loss) for so_far in seen] == list(range(4, 4 * epochs + 1, 4))
     assert fit.stopped_early
     assert epochs < 12
-
-
-def test_scipy_takes_the_same_gradient(x64):
-    batch, names = drives(scans=False), ("range", "bearing")
-    f = tuning.coordinates_objective(OBJECTIVE, START, names)
-    start, unravel = ravel_pytree({name: tuning.unconstrain(START)[name] for name in names})
-    slope = jax.jit(jax.value_and_grad(lambda x: f(unravel(x), batch)[0]))
-    found = scipy.optimize.minimize(lambda x: jax.tree.map(np.asarray, slope(x)), start, jac=True, method="L-BFGS-B")
-    assert found.success
-    assert found.fun < float(slope(start)[0]) - 0.1
-    assert np.all(np.abs(found.jac) < 1e-3)
-    with pytest.raises(ValueError, match="tuned: expected some of"):
-        tuning.coordinates_objective(OBJECTIVE, START, ("speed",))
 
 
 class Bowl:

@@ -8,21 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.stats
 from drives import CONFIG, ONLY_POSES, OWN, SHORT, drives, like
 
-from jaxlocmap import Params, simulation, tuning
+from jaxlocmap import Block, Params, Sensor, simulation, tuning
+from jaxlocmap._internal.linalg import Matrix
 from jaxlocmap.mapping.predictive import PredictiveScore
 from jaxlocmap.tuning import losses
 from jaxlocmap.tuning.filtering import check_batch, filtered
 from jaxlocmap.tuning.losses import LOSSES
 
 OTHER = Params.from_std(v=0.05, w=0.1, range=0.12, bearing=0.01, l_free=-0.43)  # ten times -0.4 is just l_min
-
-
-def without_scans():
-    batch = drives()
-    return batch._replace(inputs=batch.inputs._replace(ranges=None), beam_angles=None)
 
 
 @jax.jit
@@ -36,22 +33,33 @@ def reported(params, batch):
     return jax.tree.map(lambda x: np.asarray(x, np.float64), info), np.asarray(batch.truth, np.float64)
 
 
-@functools.partial(jax.jit, static_argnames="objective")
-def judged(objective, params, batch):
-    return objective(params, batch)
+ALL = tuning.Objective(CONFIG, tuple((name, 0.5 + i) for i, name in enumerate(sorted(LOSSES))))
+OF_POSES = tuple(name for name in ALL.names if name != "map")
 
 
-OF_POSES = ("innovation_nll", "pose_nll", "mse", "nees", "nis")
-TOGETHER = tuning.Objective(ONLY_POSES, tuple((name, 0.5 + i) for i, name in enumerate(OF_POSES)))
+@functools.cache
+def _program():
+    f = tuning.coordinates_objective(ALL, OTHER, tuning.NAMES)
+
+    @jax.jit
+    def program(params, moved, batch):
+        def judged(coordinates):
+            total, terms = f(coordinates, batch)
+            return terms, (total, terms)
+
+        at = tuning.unconstrain(params)
+        slopes, (total, terms) = jax.jacrev(judged, has_aux=True)({name: at[name] + moved[name] for name in at})
+        return total, terms, slopes
+
+    return program
 
 
-def alone(name, params, batch):
-    """One loss, of the program that all tests share."""
-    return float(judged(TOGETHER, params, batch)[1][name])
-
-
-def of_map(params, batch):
-    return float(judged(tuning.Objective(CONFIG, (("map", 1.0),)), params, batch)[0])
+def judged(params, batch, moved=None):
+    """The total, every loss, and the slope of each by every coordinate, as numbers, where the coordinates of `params`
+    have moved: the one program for drives with scans of this module.
+    """
+    moved = dict.fromkeys(tuning.NAMES, 0.0) | (moved or {})
+    return jax.tree.map(float, _program()(params, moved, batch))
 
 
 def errors(info, truth):
@@ -106,15 +114,14 @@ def some_of(batch):
     ids=["all that is there", "what is counted and known", "beyond the far quantile"],
 )
 def test_losses_are_their_formulas(params, change, tolerance):
-    batch = change(without_scans())
+    batch = change(drives())
     info, truth = reported(params, batch)
     expected = by_hand(info, truth, np.asarray(batch.counted), np.asarray(batch.known))
     assert set(expected) == set(OF_POSES)
-    total, got = judged(TOGETHER, params, batch)
-    weighted = sum(w * float(got[n]) for n, w in TOGETHER.weights)
-    assert float(total) == pytest.approx(weighted, rel=tolerance(1e-12, 1e-5))
+    total, got, _ = judged(params, batch)
+    assert total == pytest.approx(sum(w * got[n] for n, w in ALL.weights), rel=tolerance(1e-12, 1e-5))
     for name, value in expected.items():
-        assert float(got[name]) == pytest.approx(value, rel=tolerance(1e-10, 1e-3), abs=tolerance(0, 1e-5)), name
+        assert got[name] == pytest.approx(value, rel=tolerance(1e-10, 1e-3), abs=tolerance(0, 1e-5)), name
 
 
 @pytest.mark.parametrize("name", sorted(LOSSES))
@@ -131,37 +138,47 @@ def test_a_loss_has_a_function_of_its_own(name):
 
 
 def test_the_map_is_mapped_where_it_is_told(tolerance):
-    batch = drives()
+    objective, batch = tuning.Objective(CONFIG, (("map", 1.0),)), drives()
+    of_map = jax.jit(lambda batch: objective(OTHER, batch)[0])
     at_truth = batch._replace(poses=batch.truth)
-    exact = of_map(OTHER, at_truth)
-    assert exact != of_map(OTHER, batch)
-    blind = at_truth._replace(inputs=batch.inputs._replace(valid=batch.inputs.valid & False))
-    assert of_map(OTHER, blind) == pytest.approx(exact, rel=tolerance(1e-13, 1e-6))
+    exact = float(of_map(at_truth))
+    assert exact != pytest.approx(judged(OTHER, batch)[1]["map"], rel=1e-5)
+    blind = at_truth._replace(inputs=batch.inputs._replace(valid=np.zeros_like(batch.inputs.valid)))
+    assert float(of_map(blind)) == pytest.approx(exact, rel=tolerance(1e-13, 1e-6))
 
 
-@pytest.mark.parametrize("names", [OF_POSES, ("map",)])
+@pytest.mark.parametrize("names", [OF_POSES, ("map",)], ids=["of poses", "map"])
 def test_gradients_are_what_differences_give(names, x64):
-    config, tuned = (CONFIG, tuning.SENSOR_MODEL) if names == ("map",) else (ONLY_POSES, tuning.FULL_NOISE)
-    objective, batch = tuning.Objective(config, tuple((name, 1.0) for name in names)), drives()
-    f = tuning.coordinates_objective(objective, OTHER, tuned)
-    at = {key: tuning.unconstrain(OTHER)[key] for key in tuned}
+    tuned = tuning.SENSOR_MODEL if names == ("map",) else tuning.FULL_NOISE
+    batch, h = drives(), 1e-5
     along = {key: (-1.0) ** i * (1 + 0.1 * i) for i, key in enumerate(tuned)}
 
-    @jax.jit
-    def both(step):
-        """Slopes and terms, of one program."""
-        there = {key: at[key] + step * along[key] for key in tuned}
-        return jax.jacrev(lambda c: (f(c, batch)[1],) * 2, has_aux=True)(there)
+    def there(step):
+        return judged(OTHER, batch, {key: step * along[key] for key in tuned})
 
-    (slopes, _), h = both(0.0), 1e-5
-    up, down = (both(step)[1] for step in (h, -h))
+    slopes, up, down = there(0.0)[2], there(h)[1], there(-h)[1]
     for name in names:
-        slope = sum(float(slopes[name][key]) * along[key] for key in tuned)
-        assert slope == pytest.approx((float(up[name]) - float(down[name])) / (2 * h), rel=1e-5, abs=1e-8), name
+        slope = sum(slopes[name][key] * along[key] for key in tuned)
+        assert slope == pytest.approx((up[name] - down[name]) / (2 * h), rel=1e-5, abs=1e-8), name
+
+
+def test_scipy_takes_the_same_gradient(x64):
+    start, batch, names = simulation.course_params(), drives(), ("range", "bearing")
+
+    def slope(x):
+        _, terms, slopes = judged(start, batch, dict(zip(names, x.tolist(), strict=True)))
+        return terms["innovation_nll"], np.array([slopes["innovation_nll"][name] for name in names])
+
+    found = scipy.optimize.minimize(slope, np.zeros(2), jac=True, method="L-BFGS-B")
+    assert found.success
+    assert found.fun < slope(np.zeros(2))[0] - 0.1
+    assert np.all(np.abs(found.jac) < 1e-3)
+    with pytest.raises(ValueError, match="tuned: expected some of"):
+        tuning.coordinates_objective(ALL, start, ("speed",))
 
 
 def with_one_false_reading(metres):
-    batch = without_scans()
+    batch = drives()
     z = np.array(batch.inputs.z)
     n, k, j = np.argwhere(np.asarray(batch.inputs.valid))[-1]
     z[n, k, j, 0] += metres
@@ -171,43 +188,60 @@ def with_one_false_reading(metres):
 def test_a_refused_observation_pays_what_an_outlier_pays(tolerance):
     (far, count), (further, _) = with_one_false_reading(3.0), with_one_false_reading(4.0)
     (good, _), price = with_one_false_reading(0.0), math.log(2 * math.pi * ONLY_POSES.max_range / 0.01)
-    costs = [alone("innovation_nll", OWN, batch) * count for batch in (good, far, further)]
+    each = [judged(OWN, batch)[1] for batch in (good, far, further)]
+    costs = [losses["innovation_nll"] * count for losses in each]
     assert costs[1] == pytest.approx(costs[2], rel=tolerance(1e-9, 1e-5))  # bounded: as far off as you please
     best = -float(reported(OWN, good)[0].log_likelihood.max())
     assert costs[1] - costs[0] < price - best + 1
     assert price > -best  # no free reward: it costs more than the best observation gains
     # And its distance counts in `nis`, by its logarithm.
-    nis = [alone("nis", OWN, batch) for batch in (good, far, further)]
+    nis = [losses["nis"] for losses in each]
     assert nis[0] < nis[1] < nis[2] < nis[1] * 1.5
 
 
 def test_to_refuse_everything_is_no_way_to_win():
-    batch = without_scans()
+    batch = drives()
     certain = OWN._replace(Q=OWN.Q * 1e-4, R=OWN.R * 1e-4)  # nothing passes the gate after the first
+    sure, own = (judged(params, batch)[1] for params in (certain, OWN))
     for loss in ("innovation_nll", "nis"):
-        assert alone(loss, certain, batch) > alone(loss, OWN, batch) + 1
+        assert sure[loss] > own[loss] + 1
 
 
 def test_a_soft_gate_tells_the_gradient_what_it_does(x64):
     """Over 2 % of a deviation to either side the loss changes as much as its slopes add up to, though false readings
     pass in and out; behind a gate that decides, it does not.
     """
-    lying = like(SHORT, name="lying", steps=60, detector=dict(outliers=True))
-    batch = tuning.simulated(
-        jax.random.key(2), 64, simulation.room(), simulation.Noise(outlier_rate=0.1), scenario=lying
+    fix = Sensor(
+        Block("fix", ("east", "north"), ("m", "m")),
+        expected=lambda state, _: state[:2],
+        jacobian=lambda state, _: Matrix([[1, 0, 0], [0, 1, 0]]),
+        landmarks=False,  # the shortest program that there is
     )
-    own, h = tuning.unconstrain(OWN), 0.02
+    # Where false readings lie within half a metre, many lie near the gate: at four deviations of a decimetre.
+    noise = simulation.Noise(outlier_rate=0.4, blocks={"fix": 0.1})
+    detector = dict(outliers=True, period=2, max_range=0.5)
+    lying = like(SHORT, name="lying", steps=60, detector=detector, robot=dict(sensor=fix))
+    batch = tuning.simulated(jax.random.key(2), 64, simulation.room(), noise, scenario=lying)
+    own, h = simulation.own_params(noise, lying), 0.02
     places, weights = np.polynomial.legendre.leggauss(6)
     missed = {}
     for temperature in (0.0, 2.0):
-        config = dataclasses.replace(ONLY_POSES, gate_temperature=temperature)
+        config = lying.config(motion="euler", gate_probability=0.9999, grid=False)
+        config = dataclasses.replace(config, gate_temperature=temperature)
         objective = tuning.Objective(config, (("innovation_nll", 1.0),))
-        f = lambda at, batch, objective=objective: objective(tuning.constrain(own | at), batch)  # noqa: E731
-        places_w = own["w"] + h * jnp.asarray([-1, *places, 1])
-        value, slope = jax.jit(jax.vmap(lambda w, f=f: jax.jvp(lambda w: f({"w": w}, batch)[0], (w,), (1.0,))))(
-            places_w
-        )
-        change, added_up = float(value[-1] - value[0]), h * float(np.sum(weights * np.asarray(slope[1:-1])))
+
+        @jax.jit
+        @jax.vmap
+        def sloped(step, objective=objective):
+            def loss(step):
+                at = tuning.unconstrain(own, objective.blocks)
+                at |= {"east": at["east"] + step}
+                return objective(tuning.constrain(at, objective.blocks), batch)[0]
+
+            return jax.jvp(loss, (step,), (jnp.ones_like(step),))
+
+        value, slope = (np.asarray(x) for x in sloped(h * np.array([-1, *places, 1])))
+        change, added_up = float(value[-1] - value[0]), h * float(np.sum(weights * slope[1:-1]))
         missed[temperature] = abs(change - added_up) / (2 * h)
     assert missed[2.0] < 1e-3 < 0.1 < missed[0.0]
 
