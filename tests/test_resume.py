@@ -7,7 +7,7 @@ import subprocess
 import time
 
 import pytest
-from programs import ON_CPU, ROOT, WALKS, anew, ended, report, result, start
+from programs import ON_CPU, ROOT, WALKS, ended, report, result, start
 
 from jaxlocmap.cli import compute
 
@@ -42,7 +42,7 @@ def test_a_killed_study_goes_on_to_the_report_of_an_uninterrupted_one(tmp_path):
     assert 0.7 * 256 <= len(kept) < 256
     os.truncate(kept[100], 99)
 
-    status, said, err = ended(anew("-m", "jaxlocmap", "study", *STUDY, "--resume", "--out", tmp_path / "killed"))
+    status, said, err = ended(start("-m", "jaxlocmap", "study", *STUDY, "--resume", "--out", tmp_path / "killed"))
     assert status == 0, err
     assert f"part {int(kept[100].name[5:])} in {parts} is damaged" in said
     resumed = report(tmp_path / "killed")
