@@ -847,7 +847,9 @@ def of_slopes(course):
     """What a run is given of which there are slopes, and the rest."""
     inputs = course.inputs._replace(ranges=course.inputs.ranges[:, ::15])
     fields = {name: getattr(inputs, name) for name in ("control", "z", "dt")}
-    return (course.params, course.prior, fields, course.landmarks), (inputs, course.beam_angles[::15])
+    given = course.params, course.prior, fields, course.landmarks
+    # No weak types, of which a program of their own would be made.
+    return jax.tree.map(lambda x: jnp.array(np.asarray(x)), (given, (inputs, course.beam_angles[::15])))
 
 
 @pytest.fixture(scope="module")
