@@ -27,7 +27,7 @@ scenario = dataclasses.replace(loop, plant=GYRO, start=(*loop.start, 0.0), prior
 for model in (GYRO, motion.ARC):
     config = scenario.config(motion=model, gate_probability=None, grid=False)
     scene = (simulation.own_params(noise, scenario), simulation.room(), noise, scenario.prior())
-    report = summarise(monte_carlo(Study(scenario, config), jax.random.key(0), 300, *scene).value, config)
+    report = summarise(monte_carlo(Study(scenario, config), jax.random.key(0), 60, *scene).value, config)
     print(report["anees"], report["anees_band_95"], report["verdict"])
 ```
 

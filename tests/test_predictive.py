@@ -1,5 +1,7 @@
 """One scan ahead: the log-loss against plain loops, its derivatives against differences."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,10 +52,18 @@ def in_plain_loops(l_occ, l_free, counted):
     return loss, cells, bins
 
 
-def predicted(l_occ, l_free, counted, **kwargs):
-    poses, ranges = (jnp.asarray(x, jnp.result_type(float)) for x in drive())
-    amounts = (jnp.asarray(x, poses.dtype) for x in (l_occ, l_free))
-    return predict_scans(*amounts, poses, ranges, jnp.asarray(counted), scanner=scanner(), spec=SPEC, **kwargs)
+@functools.partial(jax.jit, static_argnames="bins")
+def of_drive(l_occ, l_free, counted, poses, ranges, bins):
+    return predict_scans(l_occ, l_free, poses, ranges, counted, scanner=scanner(), spec=SPEC, bins=bins)
+
+
+def predicted(l_occ, l_free, counted, bins=False):
+    given = (jnp.asarray(np.asarray(x), jnp.result_type(float)) for x in (l_occ, l_free, *drive()))
+    l_occ, l_free, *scans = given
+    return of_drive(l_occ, l_free, jnp.asarray(counted), *scans, bins=bins)
+
+
+loss_of_scan = jax.jit(functools.partial(scan_log_loss, scanner=scanner(), spec=SPEC))
 
 
 @pytest.mark.parametrize("counted", [np.ones(9, bool), np.arange(9) >= 5])
@@ -68,7 +78,7 @@ def test_it_is_what_plain_loops_give(counted, tolerance):
 def test_a_map_that_knows_nothing_pays_log_two_a_cell(tolerance):
     poses, ranges = drive()
     args = (jnp.zeros(SPEC.shape), *map(jnp.asarray, (poses[0], ranges[0])))
-    loss, cells = jax.jit(lambda *args: scan_log_loss(*args, scanner=scanner(), spec=SPEC))(*args)
+    loss, cells = loss_of_scan(*args)
     assert float(loss) == pytest.approx(float(cells) * np.log(2), rel=tolerance(1e-13, 1e-6))
 
 
@@ -89,16 +99,16 @@ def test_bins_are_those_of_plain_loops(counted, tolerance):
 def test_what_lies_beyond_the_bounds_counts_as_at_them(beyond, bound):
     poses, ranges = drive()
     args = tuple(map(jnp.asarray, (poses[0], ranges[0])))
-    losses = [
-        jax.jit(lambda *a: scan_log_loss(*a, scanner=scanner(), spec=SPEC))(jnp.full(SPEC.shape, x), *args)
-        for x in (beyond, bound)
-    ]
+    losses = [loss_of_scan(jnp.full(SPEC.shape, x), *args) for x in (beyond, bound)]
     assert losses[0] == losses[1]
 
 
 def test_derivatives_are_those_of_the_loops(x64):
     counted, h = np.ones(9, bool), 1e-6
-    slope = jax.grad(lambda x: predicted(x[0], x[1], counted).log_loss)(jnp.array([L_OCC, L_FREE]))
+    scans = (jnp.array(x) for x in (counted, *drive()))
+    slope = jax.jit(jax.grad(lambda *x: of_drive(*x, bins=False).log_loss, (0, 1)))(
+        jnp.array(L_OCC), jnp.array(L_FREE), *scans
+    )
     up, down = in_plain_loops(L_OCC + h, L_FREE, counted)[0], in_plain_loops(L_OCC - h, L_FREE, counted)[0]
     assert float(slope[0]) == pytest.approx((up - down) / (2 * h), rel=1e-6)
     up, down = in_plain_loops(L_OCC, L_FREE + h, counted)[0], in_plain_loops(L_OCC, L_FREE - h, counted)[0]

@@ -12,7 +12,7 @@ from jaxlocmap.consistency.study import Study, summarise
 scenario, noise = simulation.LOOP, simulation.Noise(range=0.1)
 config = scenario.config(motion="euler", gate_probability=None, grid=False)
 scene = (simulation.own_params(noise, scenario), simulation.room(), noise, scenario.prior())
-totals = monte_carlo(Study(scenario, config), jax.random.key(0), 500, *scene).value
+totals = monte_carlo(Study(scenario, config), jax.random.key(0), 100, *scene).value
 report = summarise(totals, config)
 print(report["anees"], report["anees_band_95"], report["verdict"])
 ```
