@@ -55,7 +55,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import checks, motion, sensors
-from jaxlocmap._internal.batching import any_in_batch, cond, scan
+from jaxlocmap._internal.batching import any_in_batch, cond, in_shard_map, scan, zero_of
 from jaxlocmap.mapping import grid
 from jaxlocmap.matching import submaps
 from jaxlocmap.parameters import Params
@@ -201,7 +201,8 @@ def _scanned(
         state, info = _recorded_turn(params, state, now[0], landmarks, beam_angles, config)
         return state, collect(clamp_map(state, config=config), info, now[1])
 
-    state, collected = scan(body, state, (inputs, aside))
+    zero = zero_of(params, state, inputs, landmarks, beam_angles) if in_shard_map() else None
+    state, collected = scan(body, state, (inputs, aside), zero=zero)
     return clamp_map(state, config=config), collected
 
 
@@ -313,6 +314,8 @@ def _observe_slots(
         rows, landmarks = jnp.zeros_like(rows), jnp.zeros((1, 2), dtype)
     possible = possible & (rows < len(landmarks))
 
+    zero = zero_of(params, belief, inputs, landmarks) if in_shard_map() else None
+
     def associate(belief: Gaussian, z: jax.Array, row: jax.Array) -> jax.Array:
         R = params.block(sensor.noise)
         best = sensors.associate(*belief, z, landmarks, R, sensor=sensor, offset=config.sensor_offset)
@@ -323,19 +326,19 @@ def _observe_slots(
         z = jnp.stack(z)
         if sensor.landmarks:
             unknown = any_in_batch(usable & (row < 0))
-            row = cond(unknown, associate, lambda belief, z, row: row, belief, z, row)
+            row = cond(unknown, associate, lambda belief, z, row: row, belief, z, row, zero=zero)
         landmark = landmarks[jnp.maximum(row, 0)]
         belief, report, used = correct(params, belief, z, landmark, row, usable, config=config)
         return belief, (report, used)
 
     def somebody(belief: Gaussian, z: jax.Array) -> tuple[Gaussian, tuple[Observation, jax.Array]]:
         z = jnp.where(possible[:, None], z, 0)
-        return scan(slot, belief, (*(z[:, i] for i in range(m)), rows, possible))
+        return scan(slot, belief, (*(z[:, i] for i in range(m)), rows, possible), zero=zero)
 
     def nobody(belief: Gaussian, _: jax.Array) -> tuple[Gaussian, tuple[Observation, jax.Array]]:
         return belief, (empty, possible)
 
-    belief, (report, used) = cond(any_in_batch(possible), somebody, nobody, belief, inputs.z)
+    belief, (report, used) = cond(any_in_batch(possible), somebody, nobody, belief, inputs.z, zero=zero)
     return Observed(belief, report, jnp.sum(report.log_likelihood), jnp.all(used == inputs.valid))
 
 

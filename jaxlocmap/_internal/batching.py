@@ -144,7 +144,7 @@ def scan(
         zero: `zero_of` all that the loop reads. Not needed; with it the carry is batched from the start, and the body
             need not be traced again to find what becomes so.
     """
-    if zero is None and _in_shard_map():
+    if zero is None and in_shard_map():
         zero = zero_of(carry, xs, body(carry, jax.tree.map(lambda x: x[0], xs)))
     scalars, stack = unstack(_add_zero(carry, zero))
     outputs: list[Callable[[list[Any]], Any]] = []
@@ -172,7 +172,7 @@ def cond(
         predicate, true, false, *operands: as of `jax.lax.cond`.
         zero: `zero_of` all that the branches read. Not needed; with it no branch is traced twice in `shard_map`.
     """
-    if not _in_shard_map():
+    if not in_shard_map():
         zero = None
     elif zero is None:
         zero = zero_of(operands, true(*operands), false(*operands))
@@ -194,7 +194,8 @@ def cond(
     return outputs[-1](results)
 
 
-def _in_shard_map() -> bool:
+def in_shard_map() -> bool:
+    """Whether this is traced inside `shard_map`."""
     return bool(jax.sharding.get_abstract_mesh().manual_axes)
 
 

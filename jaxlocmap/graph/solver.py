@@ -59,7 +59,8 @@ def solve(
             "sparsax" for large graphs (`sparse`); None chooses by size.
         steps: at most, static.
         tolerance: > 0, static: it ends with the step that promises to lower the objective by less than this share; by
-            default all that its dtype tells apart, 4e-11 in float64, which derivatives need.
+            default 4e-11 in float64. For derivatives under a robust kernel give 1e-15: there steps shrink linearly,
+            and the formula of the derivatives holds at the optimum.
 
     Returns:
         `Solution`. A graph that has no finite optimum is flagged (`converged`, `finite`); `faults` says why in words.
