@@ -155,19 +155,28 @@ def test_one_of_several_maps_in_an_array_is_like_one_alone():
 
 
 def test_maps_are_cleared_where_a_run_says_so_and_derivatives_go_with_them():
-    maps = jnp.asarray(np.random.default_rng(3).normal(size=(3, 8, 4, 6)))  # of three runs, two of 4 x 4 cells each
+    maps = np.random.default_rng(3).normal(size=(3, 8, 4, 6))  # of three runs, two of 4 x 4 cells each
     clear = np.array([[False, True], [False, False], [True, True]])
-    kept = np.repeat(~clear, 4, axis=1)[..., None, None].astype(maps.dtype)
-    nis = jnp.array([1.0, jnp.nan, 2.0])
-    np.testing.assert_array_equal(jax.vmap(lines.cleared)(maps, clear, nis), maps * kept)
+    kept = np.repeat(~clear, 4, axis=1)[..., None, None]
+    nis = np.array([1.0, np.nan, 2.0])
 
-    def loss(maps):
+    def loss(maps, clear):
         return jnp.sum(jax.vmap(lines.cleared)(maps, clear, jnp.sum(maps, axis=(1, 2, 3))) ** 2)
 
-    for slope in (jax.grad(loss)(maps), jax.jacfwd(loss)(maps)):
+    @jax.jit
+    def all_of(maps, clear, nis):
+        alone = lines.cleared(maps[0], clear[0], nis[0])
+        return (
+            jax.vmap(lines.cleared)(maps, clear, nis),
+            alone,
+            (jax.grad(loss)(maps, clear), jax.jacfwd(loss)(maps, clear)),
+        )
+
+    together, alone, slopes = all_of(*map(jnp.asarray, (maps, clear, nis)))
+    np.testing.assert_array_equal(together, maps.astype(together.dtype) * kept)
+    for slope in slopes:
         np.testing.assert_allclose(slope, 2 * maps * kept, rtol=1e-6)
-    alone = jax.jit(lines.cleared)(maps[0], clear[0], nis[0])
-    np.testing.assert_array_equal(alone, (maps * kept)[0])
+    np.testing.assert_array_equal(alone, together[0])
 
 
 def test_the_sign_of_a_normal_does_not_matter(tolerance):
@@ -361,8 +370,13 @@ def test_points_are_counted_as_a_fit_weighs_them_where_cells_are_read_at_their_c
     xy = np.stack([np.full(n, 1.05), 0.1 * np.arange(n) - 1.45], axis=1)
     points = Points(jnp.asarray(xy), jnp.tile(jnp.array([1.0, 0.0]), (n, 1)), jnp.ones(n, bool))
     drawn = add(jnp.asarray(EMPTY), jnp.array([0.03, 0.0, 0.0]), points)
-    there = lines.placed(jnp.zeros(3), points)
-    got = lines.overlap(drawn, jnp.zeros(2), there, jnp.asarray(SCALE), spec=SPEC)
+
+    @jax.jit
+    def overlap(drawn, points):
+        there = lines.placed(jnp.zeros(3), points)
+        return lines.overlap(drawn, jnp.zeros(2), there, jnp.asarray(SCALE), spec=SPEC)
+
+    got = overlap(drawn, points)
     expected = fit(drawn, jnp.zeros(3), points, jnp.asarray(SCALE))
     np.testing.assert_allclose(got, expected.weight.sum(), rtol=tolerance(1e-9, 1e-4))
     assert float(got) == pytest.approx(n * (1 - 0.01) / (1 + (0.03 / SCALE) ** 2), rel=1e-4)

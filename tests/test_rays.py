@@ -308,7 +308,7 @@ def test_a_scanner_off_the_centre_has_the_beams_of_one_where_it_sits():
     there = pose + np.array([0.4 * c + 0.3 * s, 0.4 * s - 0.3 * c, 1.9])
     ranges, angles = jnp.array([1.0, 1.7, 0.6]), jnp.array([0.3, -0.4, 2.0])
     mounted = Scanner(angles, offset, min_range=0.0, max_range=4.0)
-    got = rays.beam_cells(jnp.array(pose), ranges, mounted, spec=SPEC)
+    got = jax.jit(rays.beam_cells, static_argnames="spec")(jnp.array(pose), ranges, mounted, spec=SPEC)
     jax.tree.map(np.testing.assert_array_equal, got, cells(jnp.array(there), ranges, angles, spec=SPEC, max_range=4.0))
 
 
