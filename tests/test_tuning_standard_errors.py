@@ -92,7 +92,7 @@ def test_tied_parameters_are_named_from_a_correlation_of_095(correlation, said):
 @pytest.mark.parametrize(("share", "flat"), [(0.5e-4, True), (2e-4, False)])
 def test_a_curvature_below_one_ten_thousandth_is_none(share, flat):
     influence = np.random.default_rng(0).normal(size=(30, 2)) * 1e-6
-    found = _judge(("v", "w"), np.ones(2), np.zeros(2), np.diag([1.0, share]), influence, np.eye(2))
+    found = _judge(("v", "w"), np.ones(2), np.zeros(2), 50 * np.diag([1.0, share]), influence, np.eye(2))
     assert np.isinf(found.standard_error).tolist() == [False, flat]
     assert ("w: the loss does not depend on it here" in found.words) == flat
 
