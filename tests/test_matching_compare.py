@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from programs import Recorder, stop
 
-from jaxlocmap import GridSpec, consistency, poses, simulation
+from jaxlocmap import GridSpec, init, run, simulation
 from jaxlocmap.consistency import chi2_band
 from jaxlocmap.matching import lines, scan_match
 from jaxlocmap.matching.normals import Points, surface_points
 from jaxlocmap.matching.submaps import with_defaults
-from jaxlocmap.monte_carlo import monte_carlo
-from jaxlocmap.types import Scanner
+from jaxlocmap.se2 import between
+from jaxlocmap.types import Matcher, Scanner
 
 sys.path.append(str(Path(__file__).parent.parent / "experiments"))
 import matching_compare
@@ -82,14 +82,20 @@ def test_occupancy_is_read_between_four_cells_and_derived(tolerance):
     np.testing.assert_allclose(got.slope[used], slope[used], rtol=tolerance(1e-6, 1e-3), atol=tolerance(1e-6, 1e-2))
 
 
-def test_a_scan_on_lines_is_fitted_and_solved_as_the_library_does(tolerance):
-    """On a map of lines of the course's room, a scan of it from 4 cm and 0.02 rad beside."""
+@pytest.fixture(scope="module")
+def room_map():
+    """A map of lines of the course's room, and a scan of it from 4 cm and 0.02 rad beside."""
+    empty, pose = jnp.zeros((*SPEC.shape, lines.SUMS)), jnp.array([6.0, 2.0, 0.3])
+    drawn = jax.jit(functools.partial(lines.add_points, spec=SPEC))(empty, pose, scan_in_room(pose))
+    return drawn, scan_in_room(pose + jnp.array([0.03, -0.03, 0.02]))
+
+
+def test_a_scan_on_lines_is_fitted_and_solved_as_the_library_does(room_map, tolerance):
     mean, cov = jnp.array([6.0, 2.0, 0.3]), jnp.diag(jnp.array([0.05, 0.05, 0.02]) ** 2)
     std, scale = jnp.asarray(STD), jnp.asarray(SCALE)
 
     @jax.jit
-    def both(first, points):
-        drawn = lines.add_points(jnp.zeros((*SPEC.shape, lines.SUMS)), mean, first, spec=SPEC)
+    def both(drawn, points):
         fit = functools.partial(fits.on_lines, drawn, points=points, scale=scale, spec=SPEC)
         ours = (
             lines.fit(drawn, mean, points, scale, spec=SPEC),
@@ -97,7 +103,7 @@ def test_a_scan_on_lines_is_fitted_and_solved_as_the_library_does(tolerance):
         )
         return ours, (fit(mean), fits.solve(fit, mean, cov, std))
 
-    (expected, matched), (got, solved) = both(scan_in_room(mean), scan_in_room(jnp.array([6.03, 1.97, 0.32])))
+    (expected, matched), (got, solved) = both(*room_map)
     np.testing.assert_allclose(got.hessian, expected.hessian, rtol=tolerance(1e-10, 1e-4), atol=1e-4)
     np.testing.assert_allclose(got.pull, expected.slope, rtol=tolerance(1e-10, 1e-3), atol=1e-4)
     assert int(got.used) == np.asarray(expected.used).sum() > 20
@@ -135,7 +141,7 @@ def test_two_scans_of_a_room_tell_how_the_robot_moved():
         return fits.solve(fit, jnp.array([0.15, 0.0, 0.05]), wide, STD)
 
     solved = solve(scan_in_room(a), scan_in_room(b))
-    np.testing.assert_allclose(solved.pose, poses.between(np.asarray(a), np.asarray(b)), rtol=0, atol=2e-3)
+    np.testing.assert_allclose(solved.pose, between(a, b)[0], rtol=0, atol=2e-3)
 
 
 def linear_fit(pose, truth=(0.3, -0.2, 0.1)):
@@ -239,82 +245,39 @@ def test_moments_of_a_response_know_no_more_than_their_window(matched):
 # --- The filters ---
 
 
-RUNS, STEPS = 4, 200  # of a quick comparison
-SCENARIO = simulation.with_known_start(dataclasses.replace(simulation.LOOP, steps=STEPS))
-simulate = simulation.simulate
+SCENARIO = dataclasses.replace(simulation.LOOP, steps=40, exact_prior=False, prior_std=(1e-3,) * 3)
+CONFIG = dataclasses.replace(SCENARIO.config(motion="euler", grid=False), matcher=Matcher(period=5, gap=0.8))
+PARAMS = with_defaults(simulation.own_params(simulation.Noise(), SCENARIO))
 
 
 @functools.cache
-def drives():
-    """The runs of the seeds 0 and 1, by the keys of their drives: start, truth and inputs. On those of seed 1 no beam
-    returns.
-    """
-    world = simulation.world_of(SCENARIO)
-    world = world._replace(landmarks=world.landmarks[:0])
-
-    @jax.vmap
-    def one(seed, i):
-        first, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), i))
-        start = simulation.draw_start(first, SCENARIO.prior(), scenario=SCENARIO)
-        truth, inputs = simulate(key, world, simulation.Noise(), start, scenario=SCENARIO)
-        ranges = jnp.where(seed == 1, 8.0, inputs.ranges)
-        return jax.random.key_data(key), start, (truth, inputs._replace(ranges=ranges))
-
-    seed, i = np.divmod(np.arange(2 * RUNS, dtype=np.int32), RUNS)
-    return jax.tree.map(np.asarray, jax.jit(one)(seed, i))
-
-
-def simulated(key, world, noise, start, *, scenario):
-    """In the place of `simulate`, which would be compiled once more for every filter: what it made of such a key and
-    such a start; no number of any other.
-    """
-    keys, starts, made = drives()
-    same = jnp.all(jax.random.key_data(key)[None] == keys, axis=1) & jnp.all(
-        jnp.abs(start[None] - starts) < 1e-5, axis=1
-    )
-
-    def taken(x):
-        x = jnp.asarray(x)[jnp.argmax(same)]
-        return jnp.where(jnp.any(same), x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
-
-    return jax.tree.map(taken, made)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_program_a_filter():
-    """The program's own, whose scores carry the covariance as well, on drives that are simulated once for all."""
-    nees = consistency.nees
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(simulation, "simulate", simulated)
-        patch.setattr(consistency, "nees", lambda error, cov: (nees(error, cov), cov))
-        yield
+def drive():
+    world = simulation.room()._replace(landmarks=jnp.zeros((0, 2)))
+    simulate = jax.jit(functools.partial(simulation.simulate, scenario=SCENARIO))
+    return simulate(jax.random.key(0), world, simulation.Noise(), jnp.asarray(SCENARIO.start))
 
 
 @functools.cache
-def filtered(name, law=None, *, blind=False):
-    """Errors (RUNS, T, 3) and covariances (RUNS, T, 3, 3), at the matches of as many runs."""
-    drives()  # before anything is traced
-    config = dataclasses.replace(SCENARIO.config(motion="euler", grid=False), matcher=matching_compare._MATCHER)
-    world = simulation.world_of(SCENARIO)
-    world = world._replace(landmarks=world.landmarks[:0])
-    params = with_defaults(simulation.own_params(simulation.Noise(), SCENARIO))
-    (_, cov), error = monte_carlo(
-        matching_compare.Drive(SCENARIO, config, name),
-        jax.random.key(1 if blind else 0),
-        RUNS,
-        *(params, world, simulation.Noise(), SCENARIO.prior(), None if law is None else np.int32(law)),
-        chunk=RUNS,
-        keep_runs=True,
-    ).value
-    return np.asarray(error), np.asarray(cov)
+def program(name):
+    scanner = CONFIG.scanner(SCENARIO.beam_angles())
+    return jax.jit(functools.partial(getattr(scan_filters, name), config=CONFIG, scanner=scanner))
+
+
+def filtered(name, inputs, **law):
+    return jax.tree.map(np.asarray, program(name)(PARAMS, SCENARIO.prior(), inputs, **law))
+
+
+@functools.cache
+def odometry():
+    return filtered("odometry", drive()[1])
 
 
 def test_odometry_is_the_librarys(tolerance):
-    """What its filter believes without a scan that tells anything."""
-    (error, cov), (expected, like) = filtered("odometry", blind=True), filtered("on_submaps", blind=True)
-    assert np.isfinite(error).all()
-    np.testing.assert_allclose(error, expected, rtol=0, atol=tolerance(1e-12, 1e-5))
-    np.testing.assert_allclose(cov, like, rtol=0, atol=tolerance(1e-12, 1e-6))
+    config = dataclasses.replace(CONFIG, matcher=None)
+    filtered = jax.jit(lambda inputs: run(PARAMS, init(SCENARIO.prior(), config=config), inputs, config=config)[1])
+    info = filtered(drive()[1]._replace(ranges=None))
+    np.testing.assert_allclose(odometry().mean, info.belief.mean[::5], rtol=0, atol=tolerance(1e-12, 1e-5))
+    np.testing.assert_allclose(odometry().cov, info.belief.cov[::5], rtol=0, atol=tolerance(1e-12, 1e-6))
 
 
 LAWS = {"on_occupancy": scan_filters.ON_OCCUPANCY, "on_lines": scan_filters.ON_LINES, "on_keyframes": None}
@@ -322,13 +285,15 @@ LAWS = {"on_occupancy": scan_filters.ON_OCCUPANCY, "on_lines": scan_filters.ON_L
 
 @pytest.mark.parametrize("name", LAWS)
 def test_a_filter_is_odometry_until_a_scan_tells_something(name, tolerance):
-    law = None if LAWS[name] is None else 0
-    for got, expected in zip(filtered(name, law, blind=True), filtered("odometry", blind=True), strict=True):
+    truth, inputs = drive()
+    law = {} if LAWS[name] is None else {"law": jnp.asarray(0, jnp.int32)}
+    blind = filtered(name, inputs._replace(ranges=jnp.full_like(inputs.ranges, 8.0)), **law)
+    for got, expected in zip(blind, odometry(), strict=True):
         np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance(1e-9, 1e-5))
-    (error, cov), (alone, grown) = filtered(name, law), filtered("odometry")
-    np.testing.assert_allclose(error[:, 0], alone[:, 0], rtol=0, atol=tolerance(1e-9, 1e-5))  # nothing to match
-    assert np.all(np.linalg.det(cov[:, 2:]) < 0.5 * np.linalg.det(grown[:, 2:]))
-    assert np.abs(error[:, :8, :2]).max() < 0.05
+    got = filtered(name, inputs, **law)
+    np.testing.assert_allclose(got.mean[0], odometry().mean[0], rtol=0, atol=tolerance(1e-9, 1e-5))  # nothing to match
+    assert np.all(np.linalg.det(got.cov[2:]) < 0.5 * np.linalg.det(odometry().cov[2:]))
+    assert np.abs(got.mean - np.asarray(truth.pose)[::5])[:, :2].max() < 0.05
 
 
 @pytest.mark.parametrize("name", ["on_occupancy", "on_lines"])
@@ -339,8 +304,8 @@ def test_each_covariance_has_its_name_and_its_row(name):
     volume = {}
     for i, words in enumerate(names):
         assert any(words in way.name and way.law == i for way in matching_compare._WAYS if way.filter == name)
-        _, cov = filtered(name, i)
-        volume[words.split(" (")[0]] = np.linalg.det(cov[0, 1])
+        cov = filtered(name, drive()[1], law=jnp.asarray(i, jnp.int32)).cov
+        volume[words.split(" (")[0]] = np.linalg.det(cov[1])
     if name == "on_lines":
         assert volume["sandwich × 30"] > 2 * volume["sandwich"]
         assert volume["(JᵀJ)⁻¹ without σ²"] == max(volume.values()) > 2 * volume["σ² H⁻¹"]
@@ -406,10 +371,7 @@ def test_a_single_run_is_refused(monkeypatch, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("as_a_program")
-def test_the_filters_are_compared_on_the_same_runs(monkeypatch, tmp_path):
-    drives()
-    row = matching_compare._row
-    monkeypatch.setattr(matching_compare, "_row", lambda scores, error: row(scores[0], error))
+def test_the_filters_are_compared_on_the_same_runs(tmp_path):
     report = matching_compare.main(matching_compare.MatchingConfig(quick=True, out=tmp_path))
     assert json.loads((tmp_path / "report.json").read_text())["runs"] == report["runs"] == 4
     assert (tmp_path / "matching_compare.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
