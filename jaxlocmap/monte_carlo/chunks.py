@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -141,6 +140,8 @@ def _real(x: Any) -> jax.Array:
 
 def _chunk(run: OneRun, chunk: int) -> Callable[..., list[jax.Array]]:
     """The program of `chunk` runs: (index of the first, runs, key, args) -> arrays, as `compile` says."""
+    from jax.extend.core import jaxpr_as_fun  # imports Pallas, a fifth of a second
+
     one_run = jaxpr_as_fun(trace(run).jaxpr)
 
     def compute(first: jax.Array, runs: jax.Array, key: jax.Array, args: Any) -> list[jax.Array]:

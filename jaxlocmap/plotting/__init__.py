@@ -4,29 +4,26 @@ Raises:
     ModuleNotFoundError: matplotlib is not installed, which the extra `plot` brings.
 """
 
-import importlib
 import importlib.util
-from typing import TYPE_CHECKING, Any
 
 if importlib.util.find_spec("matplotlib") is None:
     raise ModuleNotFoundError("matplotlib is not installed: expected pip install 'jaxlocmap[plot]'", name="matplotlib")
 
-if TYPE_CHECKING:
-    from jaxlocmap.plotting.graphs import graph_figure, slam_figure
-    from jaxlocmap.plotting.maps import map_figure, trajectory_figure
-    from jaxlocmap.plotting.studies import (
-        judge_figure,
-        matching_figure,
-        precision_figure,
-        study_figure,
-        sweep_figure,
-    )
-    from jaxlocmap.plotting.tuning import (
-        calibration_figure,
-        descent_figure,
-        log_before_after_figure,
-        study_before_after_figure,
-    )
+from jaxlocmap.plotting.graphs import graph_figure, slam_figure
+from jaxlocmap.plotting.maps import map_figure, trajectory_figure
+from jaxlocmap.plotting.studies import (
+    judge_figure,
+    matching_figure,
+    precision_figure,
+    study_figure,
+    sweep_figure,
+)
+from jaxlocmap.plotting.tuning import (
+    calibration_figure,
+    descent_figure,
+    log_before_after_figure,
+    study_before_after_figure,
+)
 
 __all__ = [
     "calibration_figure",
@@ -43,12 +40,3 @@ __all__ = [
     "sweep_figure",
     "trajectory_figure",
 ]
-
-
-def __getattr__(name: str) -> Any:
-    """A figure when it is first asked for: matplotlib takes its time, and a program that is refused draws nothing."""
-    if name in __all__:
-        for module in ("graphs", "maps", "studies", "tuning"):
-            if found := vars(importlib.import_module(f"{__name__}.{module}")).get(name):
-                return found
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
