@@ -452,6 +452,9 @@ def test_a_finished_submap_reports_where_the_next_anchor_is(faults):
         statistic = np.einsum("ri,rij,rj->r", error, np.linalg.inv(cov), error)
         assert statistic.mean() < 3 + 5 * np.sqrt(6 / every.sum())
     assert not info.match.edge.mean[~info.match.finished].any()
+    # Matched is on the submap after all that were finished before.
+    before = np.cumsum(info.match.finished, axis=1) - info.match.finished
+    np.testing.assert_array_equal(info.match.submap[:, PERIOD::PERIOD], before[:, PERIOD::PERIOD])
 
 
 def test_a_submap_holds_the_scans_since_it_began_and_no_others(faults, tolerance):
