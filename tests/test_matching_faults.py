@@ -598,10 +598,16 @@ def test_a_known_map_is_matched_on_and_not_changed():
 
 
 def test_parameters_without_the_blocks_of_matching_are_refused():
-    inputs = jax.tree.map(lambda x: jnp.asarray(x[0]), cut(drive()[1]))
+    inputs = jax.tree.map(lambda x: x[0], cut(drive()[1]))
     scene = {"landmarks": ROOM.landmarks, "beam_angles": LOOP.beam_angles()}
     with pytest.raises(ValueError, match=r"params\.match_std"):
-        run(simulation.own_params(NOISE, LOOP), init(KNOWN, config=CONFIG), inputs, **scene, config=CONFIG)
+        # Where it is traced; otherwise a state would be made, piece by piece.
+        jax.eval_shape(
+            lambda prior: run(
+                simulation.own_params(NOISE, LOOP), init(prior, config=CONFIG), inputs, **scene, config=CONFIG
+            ),
+            KNOWN,
+        )
 
 
 # --- Scored in a study ---
