@@ -55,7 +55,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxlocmap import checks, motion, sensors
-from jaxlocmap._internal.batching import any_in_batch, cond, in_shard_map, scan, zero_of
+from jaxlocmap._internal.batching import any_in_batch, cond, scan, zero_in_shard_map
 from jaxlocmap.mapping import grid
 from jaxlocmap.matching import submaps
 from jaxlocmap.parameters import Params
@@ -201,7 +201,7 @@ def _scanned(
         state, info = _recorded_turn(params, state, now[0], landmarks, beam_angles, config)
         return state, collect(clamp_map(state, config=config), info, now[1])
 
-    zero = zero_of(params, state, inputs, landmarks, beam_angles) if in_shard_map() else None
+    zero = zero_in_shard_map(params, state, inputs, landmarks, beam_angles)
     state, collected = scan(body, state, (inputs, aside), zero=zero)
     return clamp_map(state, config=config), collected
 
@@ -314,7 +314,7 @@ def _observe_slots(
         rows, landmarks = jnp.zeros_like(rows), jnp.zeros((1, 2), dtype)
     possible = possible & (rows < len(landmarks))
 
-    zero = zero_of(params, belief, inputs, landmarks) if in_shard_map() else None
+    zero = zero_in_shard_map(params, belief, inputs, landmarks)
 
     def associate(belief: Gaussian, z: jax.Array, row: jax.Array) -> jax.Array:
         R = params.block(sensor.noise)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxlocmap import checks, motion, sensors
-from jaxlocmap._internal.batching import any_in_batch, cond
+from jaxlocmap._internal.batching import any_in_batch, cond, zero_in_shard_map
 from jaxlocmap._internal.linalg import is_psd, stack_scalars
 from jaxlocmap.filters import ekf
 from jaxlocmap.mapping import grid
@@ -124,7 +124,8 @@ def match(
         return belief, matching.travelled(submaps, before, belief.mean), matching.no_match(belief.mean.dtype)
 
     due = any_in_batch(submaps.steps % matcher.period == 0)  # all runs of a batch are at the same step
-    belief, submaps, report = cond(due, now, not_now, belief, submaps)
+    zero = zero_in_shard_map(params, belief, submaps, ranges, beam_angles, before)
+    belief, submaps, report = cond(due, now, not_now, belief, submaps, zero=zero)
     return belief, submaps._replace(steps=submaps.steps + 1), report
 
 

@@ -129,6 +129,11 @@ def zero_of(*trees: Any) -> jax.Array:
     return zero
 
 
+def zero_in_shard_map(*trees: Any) -> jax.Array | None:
+    """`zero_of` there, where it saves tracing a branch twice; None elsewhere, where it saves nothing."""
+    return zero_of(*trees) if _in_shard_map() else None
+
+
 def scan(
     body: Callable[[Any, Any], tuple[Any, Any]],
     carry: Any,
@@ -144,7 +149,7 @@ def scan(
         zero: `zero_of` all that the loop reads. Not needed; with it the carry is batched from the start, and the body
             need not be traced again to find what becomes so.
     """
-    if zero is None and in_shard_map():
+    if zero is None and _in_shard_map():
         zero = zero_of(carry, xs, body(carry, jax.tree.map(lambda x: x[0], xs)))
     scalars, stack = unstack(_add_zero(carry, zero))
     outputs: list[Callable[[list[Any]], Any]] = []
@@ -172,7 +177,7 @@ def cond(
         predicate, true, false, *operands: as of `jax.lax.cond`.
         zero: `zero_of` all that the branches read. Not needed; with it no branch is traced twice in `shard_map`.
     """
-    if not in_shard_map():
+    if not _in_shard_map():
         zero = None
     elif zero is None:
         zero = zero_of(operands, true(*operands), false(*operands))
@@ -194,8 +199,7 @@ def cond(
     return outputs[-1](results)
 
 
-def in_shard_map() -> bool:
-    """Whether this is traced inside `shard_map`."""
+def _in_shard_map() -> bool:
     return bool(jax.sharding.get_abstract_mesh().manual_axes)
 
 
