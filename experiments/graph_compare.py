@@ -111,10 +111,6 @@ def _values(poses: np.ndarray) -> gtsam.Values:
     return values
 
 
-def _read_back(values: gtsam.Values, count: int) -> np.ndarray:
-    return np.array([[p.x(), p.y(), p.theta()] for p in (values.atPose2(k) for k in range(count))])
-
-
 def _large(path: Path, times: int) -> dict[str, Any]:
     """One public graph, from the chordal start, which is not timed."""
     file = read_graph(path)
